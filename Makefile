@@ -1,0 +1,48 @@
+# Every target sets itself up: a .venv with the locked packages, made once and again when a lock changes.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check lock bench clean
+
+help: ## what can be made
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/'
+
+$(VENV)/user.stamp: requirements/user.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/user.lock
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(VENV)/test.stamp: requirements/test.lock $(VENV)/user.stamp
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/test.lock
+	@touch $@
+
+setup: $(VENV)/user.stamp ## the program and what it needs, in .venv
+
+demo: $(VENV)/user.stamp ## four simulated radars, then a recorded ferry: processes decide over Zenoh
+	@$(BIN)/waldnet run four-radars --speed 10 --out runs/four-radars
+	@$(BIN)/waldnet run autoferry-5 --speed 10 --out runs/autoferry-5
+	@echo
+	@echo "Look at:"
+	@ls -1 runs/four-radars/* runs/autoferry-5/* | sed 's/^/  /'
+
+test: $(VENV)/test.stamp ## all tests
+	$(BIN)/python -m pytest
+
+check: $(VENV)/test.stamp ## what CI checks beside the tests: format, lint, types, import rules
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+lock: ## resolve the locks anew from pyproject.toml (needs uv)
+	uv pip compile pyproject.toml requirements/build.in --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --quiet -o requirements/user.lock
+	uv pip compile pyproject.toml requirements/build.in --extra test -c requirements/user.lock --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --quiet -o requirements/test.lock
+
+bench: $(VENV)/test.stamp ## speed of the estimator beside Stone Soup
+	$(BIN)/python benchmarks/estimator.py
+
+clean: ## remove what was made
+	rm -rf $(VENV) runs .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build *.egg-info

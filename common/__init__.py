@@ -1,0 +1,1 @@
+"""What sensor nodes and the fusion center share."""

@@ -1,0 +1,274 @@
+"""Bytes to messages and back: the only place where wire errors are born.
+
+A payload is one msgpack array ``[version, kind, scalars, sizes, blocks]``: the scalars of the message in order, the
+sizes of its array axes, and all arrays as raw little-endian blocks in one ``bin``. A report of 1000 tracks is decoded
+without a loop over tracks. Covariances travel as their upper triangles, row by row. See docs/wire-format.md.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any, NamedTuple, TypeAlias, get_args, get_type_hints
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from common.errors import DecodeError, VersionError
+from common.messages import (
+    Advice,
+    Clock,
+    Decision,
+    DecisionKind,
+    Join,
+    Message,
+    Report,
+    Scan,
+    Start,
+    Stop,
+    Tracks,
+    sensor_of,
+)
+
+VERSION = 1
+
+
+class Block(NamedTuple):
+    """One array of a message.
+
+    Attributes:
+        field: its name in the message.
+        dtype: on the wire, little-endian.
+        axes: names of its axes; ``n^`` is a symmetric pair of axes n, sent as the upper triangle.
+        kind: dtype in memory.
+    """
+
+    field: str
+    dtype: str
+    axes: tuple[str, ...]
+    kind: str = "f8"
+
+
+def _floats(field: str, *axes: str) -> Block:
+    return Block(field, "<f8", axes)
+
+
+_IDS = Block("ids", "<u4", ("T",), "i8")
+
+#: Blocks of every kind of message; the number is the kind on the wire.
+LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
+    1: (
+        Report,
+        (_IDS, Block("terms", "u1", ("T",), "i8"), _floats("log_g", "N"), _floats("x", "N", "n"), _floats("P", "N", "n^")),
+    ),
+    2: (Scan, (_floats("position", "d"), _floats("z", "M", "m"))),
+    3: (Join, ()),
+    4: (
+        Start,
+        (
+            _IDS,
+            Block("times_ns", "<i8", ("T",), "i8"),
+            _floats("log_p_bar", "T"),
+            _floats("x", "T", "n"),
+            _floats("P", "T", "n^"),
+            _floats("x_a", "T", "n"),
+            _floats("P_a", "T", "n^"),
+        ),
+    ),
+    5: (Stop, (_IDS,)),
+    6: (Advice, (_IDS, _floats("x", "T", "n"), _floats("P", "T", "n^"))),
+    7: (Clock, ()),
+    8: (
+        Tracks,
+        (
+            _IDS,
+            Block("status", "u1", ("T",), "u1"),
+            Block("scans", "<u4", ("T",), "i8"),
+            Block("contributing", "u1", ("T", "S"), "?"),
+            _floats("log_lr", "T"),
+            _floats("log_lr_total", "T"),
+            _floats("x", "T", "n"),
+            _floats("P", "T", "n^"),
+        ),
+    ),
+    9: (Decision, ()),
+}
+_KINDS = {message: kind for kind, (message, _) in LAYOUTS.items()}
+#: No state is larger; keeps a forged header from asking for memory.
+_MAX_STATE = 64
+#: Messages whose sensor is the one in the key.
+_KEYED = (Report, Scan, Join, Start, Stop)
+
+_AnyArray: TypeAlias = NDArray[Any]
+
+
+def encode(message: Message) -> bytes:
+    """A message as bytes.
+
+    Returns:
+        the payload; the name of the sensor it comes from or goes to is in the key instead.
+    """
+    kind = _KINDS[type(message)]
+    sizes: dict[str, int] = {}
+    raw = []
+    for block in LAYOUTS[kind][1]:
+        array: _AnyArray = getattr(message, block.field)
+        for axis, size in zip(block.axes, array.shape, strict=False):
+            sizes[axis.rstrip("^")] = size
+        if block.axes[-1].endswith("^"):
+            array = array[..., *_upper(array.shape[-1])]
+        raw.append(np.ascontiguousarray(array, dtype=block.dtype).tobytes())
+    scalars = [getattr(message, name) for name, _ in _scalars(type(message))]
+    return bytes(msgpack.packb([VERSION, kind, scalars, list(sizes.values()), b"".join(raw)]))
+
+
+def decode(key: str, payload: bytes) -> Message:
+    """Bytes as a message.
+
+    Args:
+        key: where they came from; names the sensor, and the place in errors.
+        payload: the bytes.
+
+    Raises:
+        VersionError: another wire version.
+        DecodeError: anything else that is no message; never another exception.
+    """
+    try:
+        version, body = _open(payload)
+        if version != VERSION:
+            raise VersionError(f"version {version}, this program reads {VERSION}")
+        return _decode_body(sensor_of(key), body)
+    except DecodeError as error:
+        raise type(error)(f"{key}: {len(payload)} bytes are no message: {error}") from None
+
+
+def _open(payload: bytes) -> tuple[int, list[Any]]:
+    try:
+        envelope = msgpack.unpackb(payload, use_list=True)
+    except (ValueError, TypeError, OverflowError, msgpack.UnpackException) as error:
+        raise DecodeError(f"not msgpack ({type(error).__name__})") from None
+    if not isinstance(envelope, list) or len(envelope) == 0 or not _is_int(envelope[0]):
+        raise DecodeError("expected an array that starts with the version")
+    return envelope[0], envelope[1:]
+
+
+def _decode_body(sensor: str, body: list[Any]) -> Message:
+    if len(body) != 4:
+        raise DecodeError(f"{len(body) + 1} elements, expected 5: version, kind, scalars, sizes, blocks")
+    kind, scalars, sizes, blocks = body
+    if not _is_int(kind) or kind not in LAYOUTS:
+        raise DecodeError(f"kind {kind!r} is unknown")
+    message, layout = LAYOUTS[kind]
+    fields = _decode_scalars(message, scalars)
+    fields.update(_decode_blocks(layout, sizes, blocks))
+    if message in _KEYED:
+        if not sensor:
+            raise DecodeError(f"a {message.__name__} does not belong on this key")
+        fields["sensor"] = sensor
+    decoded: Message = message(**fields)
+    _check(decoded)
+    return decoded
+
+
+def _decode_scalars(message: type, scalars: Any) -> dict[str, Any]:
+    expected = _scalars(message)
+    if not isinstance(scalars, list) or len(scalars) != len(expected):
+        raise DecodeError(f"expected the {len(expected)} scalars of a {message.__name__}")
+    fields: dict[str, Any] = {}
+    for (name, hint), value in zip(expected, scalars, strict=True):
+        if hint == "tuple":
+            good = isinstance(value, list) and all(isinstance(item, str) for item in value)
+            fields[name] = tuple(value) if good else None
+        elif hint == "int":
+            good = _is_int(value) and -(2**63) <= value < 2**63
+            fields[name] = value
+        else:
+            good = isinstance(value, float) if hint == "float" else isinstance(value, str)
+            fields[name] = value
+        if not good:
+            raise DecodeError(f"{name} is a {type(value).__name__}, expected {hint}")
+    return fields
+
+
+def _decode_blocks(layout: tuple[Block, ...], sizes: Any, blocks: Any) -> dict[str, _AnyArray]:
+    axes = list(dict.fromkeys(axis.rstrip("^") for block in layout for axis in block.axes))
+    if not isinstance(sizes, list) or len(sizes) != len(axes) or not all(_is_int(size) and size >= 0 for size in sizes):
+        raise DecodeError(f"expected the sizes of the axes {', '.join(axes) or '(none)'}")
+    if not isinstance(blocks, bytes):
+        raise DecodeError(f"blocks are a {type(blocks).__name__}, expected bin")
+    size_of = dict(zip(axes, sizes, strict=True))
+    if any(size > max(_MAX_STATE, len(blocks)) for size in sizes) or size_of.get("n", 0) > _MAX_STATE:
+        raise DecodeError(f"sizes {sizes} are larger than the {len(blocks)} bytes of blocks can hold")
+    counts = [_count(block, size_of) for block in layout]
+    expected = sum(count * np.dtype(block.dtype).itemsize for block, count in zip(layout, counts, strict=True))
+    if expected != len(blocks):
+        raise DecodeError(f"{len(blocks)} bytes of blocks, expected {expected}")
+    fields: dict[str, _AnyArray] = {}
+    offset = 0
+    for block, count in zip(layout, counts, strict=True):
+        flat = np.frombuffer(blocks, block.dtype, count, offset)
+        offset += flat.nbytes
+        fields[block.field] = _shape(flat.astype(block.kind), block, size_of)
+    return fields
+
+
+def _count(block: Block, size_of: dict[str, int]) -> int:
+    count = 1
+    for axis in block.axes:
+        size = size_of[axis.rstrip("^")]
+        count *= size * (size + 1) // 2 if axis.endswith("^") else size
+    return count
+
+
+def _shape(flat: _AnyArray, block: Block, size_of: dict[str, int]) -> _AnyArray:
+    if not block.axes[-1].endswith("^"):
+        return flat.reshape([size_of[axis] for axis in block.axes])
+    n = size_of[block.axes[-1].rstrip("^")]
+    lead = [size_of[axis] for axis in block.axes[:-1]]
+    upper = flat.reshape((*lead, n * (n + 1) // 2))
+    full = np.empty((*lead, n, n))
+    rows, columns = _upper(n)
+    full[..., rows, columns] = upper
+    full[..., columns, rows] = upper
+    return full
+
+
+def _check(message: Message) -> None:
+    """What the layout alone cannot say."""
+    for name, value in message._asdict().items():
+        if isinstance(value, np.ndarray) and value.dtype == np.float64:
+            # log p_bar of a scan that h1 holds for impossible is -inf.
+            bad = np.isnan(value) | (value == np.inf) if name.startswith("log_") else ~np.isfinite(value)
+            if bad.any():
+                raise DecodeError(f"{name} has {int(bad.sum())} values that are not finite")
+    ids = getattr(message, "ids", None)
+    if ids is not None and (np.diff(ids) <= 0).any():
+        raise DecodeError("ids are not ascending")
+    if isinstance(message, Report):
+        terms = message.terms
+        if (terms < 1).any() or terms.sum() != len(message.log_g):
+            raise DecodeError(f"{int(terms.sum())} terms of tracks, {len(message.log_g)} terms sent")
+    if isinstance(message, Decision) and message.kind not in get_args(DecisionKind):
+        raise DecodeError(f"decision {message.kind!r} is unknown")
+
+
+@cache
+def _scalars(message: type) -> tuple[tuple[str, str], ...]:
+    """Names and types of the scalar fields of a message, in order."""
+    blocks = {block.field for block in LAYOUTS[_KINDS[message]][1]}
+    names = {int: "int", float: "float", tuple[str, ...]: "tuple"}
+    return tuple(
+        (name, names.get(hint, "str"))
+        for name, hint in get_type_hints(message).items()
+        if name not in blocks and not (name == "sensor" and message in _KEYED)
+    )
+
+
+@cache
+def _upper(n: int) -> tuple[_AnyArray, _AnyArray]:
+    rows, columns = np.triu_indices(n)
+    return rows, columns
+
+
+def _is_int(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)

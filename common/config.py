@@ -1,0 +1,462 @@
+"""Scenario and network files, validated once: every fault at once, each with its path."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterator, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
+
+from common.errors import ConfigError
+from common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
+from common.estimation.gaussian import Array, Gaussian
+from common.estimation.motion import ConstantVelocity, Motion
+from common.estimation.representation import Share
+from common.estimation.sensing import Position, Sensor
+from common.estimation.sprt import Thresholds, thresholds
+
+NS_PER_S = 1_000_000_000
+
+
+def _probability(value: float) -> float:
+    if not 0.0 <= value <= 1.0:
+        raise ValueError(f"{value:g} is not a probability (0 to 1)")
+    return value
+
+
+def _inner_probability(value: float) -> float:
+    if not 0.0 < value < 1.0:
+        raise ValueError(f"{value:g} is not a probability strictly between 0 and 1")
+    return value
+
+
+def _gate_probability(value: float) -> float:
+    if not 0.0 < value <= 1.0:
+        raise ValueError(f"{value:g} is not a probability above 0 (1 is no gate)")
+    return value
+
+
+def _positive(value: float) -> float:
+    if not 0.0 < value < float("inf"):
+        raise ValueError(f"{value:g} is not positive and finite")
+    return value
+
+
+def _not_negative(value: float) -> float:
+    if not 0.0 <= value < float("inf"):
+        raise ValueError(f"{value:g} is not zero or positive and finite")
+    return value
+
+
+def _finite(value: float) -> float:
+    if not np.isfinite(value):
+        raise ValueError(f"{value:g} is not finite")
+    return value
+
+
+def _false_plots(value: float) -> float:
+    if not 0.0 < value < float("inf"):
+        raise ValueError(
+            f"{value:g} is not positive and finite; without false plots one plot would prove a target and there is "
+            "nothing to test: give the smallest mean you believe, such as 1e-6"
+        )
+    return value
+
+
+def _zoned(value: datetime) -> datetime:
+    if value.tzinfo is None:
+        raise ValueError(f"{value.isoformat()} has no time zone; write it like 2026-01-01T00:00:00Z")
+    return value
+
+
+Probability = Annotated[float, AfterValidator(_probability)]
+InnerProbability = Annotated[float, AfterValidator(_inner_probability)]
+GateProbability = Annotated[float, AfterValidator(_gate_probability)]
+Positive = Annotated[float, AfterValidator(_positive)]
+NotNegative = Annotated[float, AfterValidator(_not_negative)]
+Finite = Annotated[float, AfterValidator(_finite)]
+Instant = Annotated[datetime, AfterValidator(_zoned)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+
+class Network(_Model):
+    """How one process takes part in a Zenoh network; endpoints look like ``tcp/192.168.1.7:7447``."""
+
+    name: Name = "waldnet"
+    mode: Literal["peer", "client", "router"] = "peer"
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    multicast: bool = False
+
+
+class Origin(_Model):
+    """Origin of the local east-north frame."""
+
+    latitude: Annotated[float, Field(ge=-90.0, le=90.0)]
+    longitude: Annotated[float, Field(ge=-180.0, le=180.0)]
+
+
+class MotionConfig(_Model):
+    """How targets move; psd in m^2/s^3."""
+
+    model: Literal["cv"] = "cv"
+    dimensions: Literal[2, 3] = 2
+    psd: NotNegative
+
+    def build(self) -> Motion:
+        """The motion model."""
+        return ConstantVelocity(self.dimensions, self.psd)
+
+
+class DecisionConfig(_Model):
+    """Wald's test: p0 accept h1 under h0, p1 accept h1 under h1; not enabled, LR is computed and nothing decided."""
+
+    p0: InnerProbability = 1e-4
+    p1: InnerProbability = 0.95
+    enabled: bool = True
+
+    @property
+    def thresholds(self) -> Thresholds:
+        """Log A and log B."""
+        return thresholds(self.p0, self.p1)
+
+
+class FusionConfig(_Model):
+    """How the network shares a density and who associates.
+
+    Attributes:
+        mode: representation of the product (theory.md §4).
+        association: the factor's own, or tight (theory.md §5).
+        feedback: advice gives the fused track back to the association filters (theory.md §6).
+        filter: local filter.
+        gate_probability: that the target's plot lies inside the gate; 1 is no gate.
+        hold_back: how long the center waits for a sensor that is overdue [s].
+        window: how far back a late report is still worked in [s of measurement time].
+    """
+
+    mode: Literal["naive", "federated", "dkf"] = "federated"
+    association: Literal["factor", "tight"] = "tight"
+    feedback: Literal["none", "advice"] = "none"
+    filter: Literal["pdaf"] = "pdaf"
+    gate_probability: GateProbability = 0.9997
+    hold_back: NotNegative = 0.5
+    window: NotNegative = 10.0
+
+
+class EverywhereConfig(_Model):
+    """Sees everywhere; the area only gives the density of false plots [m^2, in 3-D m^3]."""
+
+    shape: Literal["everywhere"]
+    area: Positive
+
+    def build(self, dimensions: int) -> FieldOfView:
+        """The field of view."""
+        return Everywhere(self.area, dimensions)
+
+
+class BoxConfig(_Model):
+    """A box with full side lengths ``size`` [m]; without a center it moves with the sensor."""
+
+    shape: Literal["box"]
+    size: tuple[Positive, ...]
+    center: tuple[Finite, ...] | None = None
+
+    def build(self, dimensions: int) -> FieldOfView:  # noqa: ARG002 (the size tells)
+        """The field of view."""
+        return Box(self.size)
+
+
+class DiscConfig(_Model):
+    """A disc, in 3-D a ball, of ``radius`` [m]; without a center it moves with the sensor."""
+
+    shape: Literal["disc"]
+    radius: Positive
+    center: tuple[Finite, ...] | None = None
+
+    def build(self, dimensions: int) -> FieldOfView:
+        """The field of view."""
+        return Disc(self.radius, dimensions)
+
+
+FieldOfViewConfig: TypeAlias = Annotated[EverywhereConfig | BoxConfig | DiscConfig, Field(discriminator="shape")]
+
+
+class SensorConfig(_Model):
+    """One sensor: where it stands, what it measures, how surely, and when.
+
+    Attributes:
+        sigma: standard deviations of a plot [m].
+        position: east, north (, up) [m]; a recorded scan may override it. Default: the origin.
+        p_d: detection probability inside the field of view.
+        false_plots: mean false plots per scan, uniform in the field of view.
+        scan_interval: seconds between scans.
+        first_scan: time of the first one [s]; default: one interval after the start.
+    """
+
+    name: Name
+    kind: Literal["position"] = "position"
+    position: tuple[Finite, ...] | None = None
+    sigma: tuple[Positive, ...]
+    p_d: Probability
+    false_plots: Annotated[float, AfterValidator(_false_plots)]
+    field_of_view: FieldOfViewConfig
+    scan_interval: Positive = 1.0
+    first_scan: NotNegative | None = None
+
+    def build(self, motion: Motion) -> Sensor:
+        """The sensor model for states of a motion model."""
+        return Sensor(
+            Position(self.sigma, motion.n),
+            self.p_d,
+            self.false_plots,
+            self.field_of_view.build(motion.dimensions),
+        )
+
+    def stand(self, dimensions: int, moved_to: tuple[float, ...] | None = None) -> Array:
+        """Where the sensor stands during a scan [m], shape (d,)."""
+        return np.array(moved_to or self.position or (0.0,) * dimensions)
+
+    def view_center(self, stand: Array) -> Array:
+        """Center of the field of view of a sensor that stands at ``stand``, shape (d,)."""
+        fov = self.field_of_view
+        return stand if isinstance(fov, EverywhereConfig) or fov.center is None else np.array(fov.center)
+
+
+class SimulationConfig(_Model):
+    """The simulated world: how long [s], and the seed of everything random."""
+
+    duration: Positive
+    seed: Annotated[int, Field(ge=0)] = 1
+
+
+class RecordingConfig(_Model):
+    """Recorded plots (JSON Lines), path relative to the scenario file."""
+
+    plots: Path
+
+
+class TargetConfig(_Model):
+    """A simulated target: a state at its start, or drawn from the density of a hypothesis; it moves as ``motion`` says.
+
+    Attributes:
+        start: when it appears [s].
+        state: position and velocity [m, m/s].
+        hypothesis: index of the hypothesis whose density it is drawn from.
+    """
+
+    start: Finite = 0.0
+    state: tuple[Finite, ...] | None = None
+    hypothesis: Annotated[int, Field(ge=0)] | None = None
+
+
+class HypothesisConfig(_Model):
+    """A track to be decided on: start [s], mean and standard deviations of position and velocity [m, m/s]."""
+
+    start: Finite = 0.0
+    state: tuple[Finite, ...]
+    sigma: tuple[Positive, ...]
+
+    @property
+    def density(self) -> Gaussian:
+        """The prior N(x0, P0)."""
+        return Gaussian(np.array(self.state), np.diag(np.square(self.sigma)))
+
+
+class Scenario(_Model):
+    """One file: a network and, if wanted, the simulated world or the recorded plots it looks at.
+
+    Attributes:
+        epoch: the instant of scenario time 0.
+    """
+
+    name: Name
+    origin: Origin | None = None
+    epoch: Instant = datetime(2026, 1, 1, tzinfo=UTC)
+    network: Network = Network()
+    motion: MotionConfig
+    decision: DecisionConfig = DecisionConfig()
+    fusion: FusionConfig = FusionConfig()
+    sensors: Annotated[tuple[SensorConfig, ...], Field(alias="sensor", min_length=1)]
+    simulation: SimulationConfig | None = None
+    recording: RecordingConfig | None = None
+    targets: Annotated[tuple[TargetConfig, ...], Field(alias="target")] = ()
+    hypotheses: Annotated[tuple[HypothesisConfig, ...], Field(alias="hypothesis")] = ()
+
+    @property
+    def epoch_ns(self) -> int:
+        """The epoch in nanoseconds since the Unix epoch."""
+        since = self.epoch - datetime(1970, 1, 1, tzinfo=UTC)
+        return ((since.days * 86_400 + since.seconds) * 1_000_000 + since.microseconds) * 1_000
+
+    def to_ns(self, time_s: float) -> int:
+        """Scenario seconds to nanoseconds since the Unix epoch."""
+        return self.epoch_ns + round(time_s * NS_PER_S)
+
+    def to_seconds(self, t_ns: int) -> float:
+        """Nanoseconds since the Unix epoch to scenario seconds."""
+        return (t_ns - self.epoch_ns) / NS_PER_S
+
+    @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names in the order of the file."""
+        return tuple(sensor.name for sensor in self.sensors)
+
+    def sensor(self, name: str) -> SensorConfig:
+        """The sensor of that name.
+
+        Raises:
+            ConfigError: when there is none.
+        """
+        for sensor in self.sensors:
+            if sensor.name == name:
+                return sensor
+        raise ConfigError(f"{self.name}: no sensor {name!r}; there are {', '.join(self.sensor_names)}")
+
+    @property
+    def share(self) -> Share:
+        """A sensor's share of prior and process noise."""
+        return Share(1.0 if self.fusion.mode == "naive" else float(len(self.sensors)))
+
+
+def load_scenario(path: Path) -> Scenario:
+    """Read and validate a scenario file.
+
+    Raises:
+        ConfigError: naming every fault.
+    """
+    data = _read_toml(path)
+    if isinstance(name := data.get("name"), str) and isinstance(network := data.setdefault("network", {}), dict):
+        network.setdefault("name", name)
+    faults = list(_cross_faults(data))
+    try:
+        scenario = Scenario.model_validate(data)
+    except ValidationError as error:
+        faults = [*_describe_all(error), *faults]
+    if faults:
+        raise ConfigError("\n".join(f"{path}: {fault}" for fault in faults))
+    if scenario.recording is not None:
+        plots = path.parent / scenario.recording.plots
+        scenario = scenario.model_copy(update={"recording": RecordingConfig(plots=plots)})
+    return scenario
+
+
+def load_network(path: Path) -> Network:
+    """Read and validate a network file: the keys of ``[network]`` at its top level.
+
+    Raises:
+        ConfigError: naming every fault.
+    """
+    try:
+        return Network.model_validate(_read_toml(path))
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{path}: {fault}" for fault in _describe_all(error))) from None
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: is no UTF-8 text: {error.reason} at byte {error.start}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: is no TOML: {error}") from None
+
+
+def _describe_all(error: ValidationError) -> Iterator[str]:
+    details = error.errors(include_url=False)
+    for detail in details:
+        # A list whose entries are all wrong is also reported as too short; one fault is enough.
+        inner = any(other["loc"][: len(detail["loc"])] == detail["loc"] for other in details if other is not detail)
+        if not (detail["type"] == "too_short" and inner):
+            yield _describe(detail)
+
+
+def _describe(detail: ErrorDetails) -> str:
+    """One fault as ``path: what was got, what was expected``."""
+    # A tagged union puts the tag into the location; it is no key of the file.
+    tags = {"everywhere", "box", "disc"}
+    where = ".".join(str(part) for part in detail["loc"] if part not in tags)
+    kind, got, context = detail["type"], detail["input"], detail.get("ctx", {})
+    if kind == "missing":
+        text = "is missing"
+    elif kind == "extra_forbidden":
+        text = "is no known key"
+    elif kind == "literal_error":
+        text = f"{got!r} is not one of {context['expected']}"
+    elif kind == "union_tag_invalid":
+        text = f"shape {context['tag']!r} is not one of {context['expected_tags']}"
+    elif kind == "union_tag_not_found":
+        text = "shape is missing"
+    elif kind == "value_error":
+        text = str(context["error"])
+    else:
+        message = detail["msg"]
+        text = f"got {got!r}: {message[0].lower()}{message[1:]}"
+    return f"{where}: {text}"
+
+
+def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
+    """Faults between keys; tolerant of whatever else is wrong, so that all faults are named at once."""
+    dimensions = _table(data, "motion").get("dimensions", 2)
+    sensors, hypotheses = _tables(data, "sensor"), _tables(data, "hypothesis")
+    if dimensions in (2, 3):
+        for i, sensor in enumerate(sensors):
+            fov = _table(sensor, "field_of_view")
+            yield from _wrong_length(sensor, ("sigma", "position"), dimensions, f"sensor.{i}")
+            yield from _wrong_length(fov, ("size", "center"), dimensions, f"sensor.{i}.field_of_view")
+        for kind in ("hypothesis", "target"):
+            for i, entry in enumerate(_tables(data, kind)):
+                yield from _wrong_length(entry, ("state", "sigma"), 2 * dimensions, f"{kind}.{i}")
+    yield from _repeated_names(sensors)
+    for i, target in enumerate(_tables(data, "target")):
+        drawn = target.get("hypothesis")
+        if (drawn is None) == (target.get("state") is None):
+            yield f"target.{i}: give either state or hypothesis"
+        elif isinstance(drawn, int) and drawn >= len(hypotheses):
+            yield f"target.{i}.hypothesis: {drawn} is not one of the {len(hypotheses)} hypotheses (counted from 0)"
+    yield from _decision_faults(_table(data, "decision"))
+    fusion = _table(data, "fusion")
+    if fusion.get("feedback") == "advice" and fusion.get("association", "tight") != "tight":
+        yield "fusion.feedback: 'advice' steers the association filter, which only association = 'tight' has"
+
+
+def _table(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = data.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def _tables(data: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
+    value = data.get(key)
+    return [entry if isinstance(entry, dict) else {} for entry in value] if isinstance(value, list) else []
+
+
+def _wrong_length(entry: Mapping[str, Any], keys: tuple[str, ...], length: int, where: str) -> Iterator[str]:
+    for key in keys:
+        value = entry.get(key)
+        if isinstance(value, list) and len(value) != length:
+            yield f"{where}.{key}: has {len(value)} numbers, this scenario's dimensions need {length}"
+
+
+def _repeated_names(sensors: list[Mapping[str, Any]]) -> Iterator[str]:
+    seen: set[Any] = set()
+    for i, sensor in enumerate(sensors):
+        name = sensor.get("name")
+        if isinstance(name, str) and name in seen:
+            yield f"sensor.{i}.name: {name!r} is taken already"
+        seen.add(name if isinstance(name, str) else None)
+
+
+def _decision_faults(decision: Mapping[str, Any]) -> Iterator[str]:
+    p0, p1 = decision.get("p0", 1e-4), decision.get("p1", 0.95)
+    if isinstance(p0, float) and isinstance(p1, float) and 0.0 < p1 <= p0 < 1.0:
+        yield f"decision.p1: {p1:g} is not above p0 = {p0:g}; no threshold lies between"

@@ -1,0 +1,37 @@
+"""Every error a user can meet.
+
+::
+
+    WaldnetError
+    ├── ConfigError          a scenario or network file is wrong; every fault listed
+    ├── PlotsError           a file of recorded plots is wrong; file and line named
+    ├── DecodeError          bytes that are no message of ours
+    │   └── VersionError     a message of another wire version
+    └── TransportError       the network: endpoint taken, nothing answers
+"""
+
+from __future__ import annotations
+
+
+class WaldnetError(Exception):
+    """Base of all errors that are not our own bugs."""
+
+
+class ConfigError(WaldnetError):
+    """A scenario or network file is wrong; the message lists every fault with its path."""
+
+
+class PlotsError(WaldnetError):
+    """A file of recorded plots is wrong; the message names file and line."""
+
+
+class DecodeError(WaldnetError):
+    """Bytes that are no message of ours: what was got and what was expected."""
+
+
+class VersionError(DecodeError):
+    """A message of another wire version."""
+
+
+class TransportError(WaldnetError):
+    """The network does not do what was asked: an endpoint is taken, nothing answers."""

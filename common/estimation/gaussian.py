@@ -1,0 +1,147 @@
+"""Gaussian densities: log pdf, products, moments."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array: TypeAlias = NDArray[np.float64]
+BoolArray: TypeAlias = NDArray[np.bool_]
+
+LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+class Gaussian(NamedTuple):
+    """Gaussian densities, one per leading batch index.
+
+    Attributes:
+        x: means, shape (..., n).
+        P: covariances, shape (..., n, n), symmetric positive definite.
+    """
+
+    x: Array
+    P: Array
+
+
+class Product(NamedTuple):
+    """A product of Gaussian densities: ``c N(x; mean, covariance)``.
+
+    Attributes:
+        density: the normalised product, shapes (..., n), (..., n, n).
+        log_c: logarithm of the normalisation constant c, shape (...).
+    """
+
+    density: Gaussian
+    log_c: Array
+
+
+def symmetric(P: Array) -> Array:
+    """Return the symmetric part of ``P``, shape (..., n, n): rounding never adds up to a skew."""
+    return 0.5 * (P + P.mT)
+
+
+def whiten(L: Array, d: Array) -> Array:
+    """Solve ``L w = d`` by forward substitution.
+
+    NumPy has no batched triangular solve; its rows are few, so a loop over them is faster than a general solve.
+
+    Args:
+        L: lower Cholesky factors, shape (..., n, n).
+        d: right-hand sides, shape (..., n), broadcast against the batch axes of ``L``.
+
+    Returns:
+        w, shape (..., n).
+    """
+    n = L.shape[-1]
+    w = np.empty(np.broadcast_shapes(L.shape[:-1], d.shape))
+    for i in range(n):
+        rest = d[..., i]
+        for j in range(i):
+            rest = rest - L[..., i, j] * w[..., j]
+        w[..., i] = rest / L[..., i, i]
+    return w
+
+
+def half_log_det(L: Array) -> Array:
+    """``0.5 log det P`` from the Cholesky factor ``L`` of P, shape (..., n, n) to (...)."""
+    return np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
+
+
+def log_pdf(at: Array, density: Gaussian) -> Array:
+    """Logarithm of ``N(at; x, P)``.
+
+    Args:
+        at: points, shape (..., n), broadcast against the batch axes of ``density``.
+        density: the Gaussians.
+
+    Returns:
+        log density, shape (...).
+    """
+    L = np.linalg.cholesky(density.P)
+    w = whiten(L, at - density.x)
+    return -0.5 * np.vecdot(w, w) - half_log_det(L) - 0.5 * LOG_2PI * L.shape[-1]
+
+
+def product(factors: Gaussian, members: BoolArray | None = None) -> Product:
+    r"""Normalised product of several factors and its constant (Eq. 8, 9): one batched pass, no fold.
+
+    The density is the convex combination (information sum) of Eq. (9). For the constant, evaluate the identity
+    ``prod_s N(x; x^s, P^s) = c N(x; x_f, P_f)`` at x = x_f, where the right side is ``c |2 pi P_f|^(-1/2)``::
+
+        log c = sum_s log N(x_f; x^s, P^s) + 0.5 log |2 pi P_f|
+
+    This is Eq. (8) without its order of sensors: every term is a difference to one and the same point.
+
+    Args:
+        factors: x of shape (..., S, n), P of shape (..., S, n, n); axis -2 of x counts the sensors.
+        members: shape (..., S); factors that are no members count as constant 1. None: all are members.
+
+    Returns:
+        the product; where there is a single member c = 1.
+
+    References:
+        theory.md Eq. (8), (9); N. Carlson, Federated square root filter (1990).
+    """
+    n = factors.x.shape[-1]
+    share = np.ones(factors.x.shape[:-1]) if members is None else members.astype(np.float64)
+    L = np.linalg.cholesky(factors.P)
+    # Rows of W: the columns of L^-1, so that P^-1 = W W'.
+    W = whiten(L[..., None, :, :], np.eye(n))
+    information = np.einsum("...s,...sik,...sjk->...ij", share, W, W)
+    # Relative to the first factor, so that large coordinates cost no digits.
+    reference = factors.x[..., :1, :]
+    v = np.einsum("...s,...sik,...sk->...i", share, W, whiten(L, factors.x - reference))
+    C = np.linalg.cholesky(information)
+    V = whiten(C[..., None, :, :], np.eye(n))
+    P = V @ V.mT
+    x = reference[..., 0, :] + np.matvec(P, v)
+    w = whiten(L, x[..., None, :] - factors.x)
+    terms = -0.5 * np.vecdot(w, w) - half_log_det(L) - 0.5 * LOG_2PI * n
+    log_c = (share * terms).sum(axis=-1) - half_log_det(C) + 0.5 * LOG_2PI * n
+    return Product(Gaussian(x, P), log_c)
+
+
+def moments(weights: Array, components: Gaussian) -> Gaussian:
+    """Mean and covariance of Gaussian mixtures (moment matching).
+
+    Args:
+        weights: shape (..., K), non-negative with sum one.
+        components: x of shape (..., K, n), P of shape (..., K, n, n).
+
+    Returns:
+        one Gaussian per mixture, shapes (..., n), (..., n, n).
+    """
+    x = np.einsum("...k,...ki->...i", weights, components.x)
+    d = components.x - x[..., None, :]
+    P = np.einsum("...k,...kij->...ij", weights, components.P) + np.einsum("...k,...ki,...kj->...ij", weights, d, d)
+    return Gaussian(x, symmetric(P))
+
+
+def log_sum_exp(log_weights: Array) -> Array:
+    """``log sum exp`` over the last axis, shape (..., K) to (...); all weights zero gives -inf without a warning."""
+    top = log_weights.max(axis=-1, keepdims=True)
+    safe = np.where(np.isfinite(top), top, 0.0)
+    total = np.exp(log_weights - safe).sum(axis=-1)
+    return np.log(total, out=np.full_like(total, -np.inf), where=total > 0.0) + safe[..., 0]

@@ -1,0 +1,89 @@
+"""Wald's sequential test (Eq. 14) and the life of a track under it (theory.md §7)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.estimation.gaussian import Array, BoolArray
+
+
+class Status(IntEnum):
+    """What has been decided about a track."""
+
+    TENTATIVE = 0
+    CONFIRMED = 1
+    DELETED = 2
+
+
+StatusArray = NDArray[np.uint8]
+
+
+class Thresholds(NamedTuple):
+    """Thresholds on log LR.
+
+    Attributes:
+        log_a: below: accept h0, delete.
+        log_b: above: accept h1, confirm.
+    """
+
+    log_a: float
+    log_b: float
+
+
+class Verdict(NamedTuple):
+    """Outcome of one step of the test.
+
+    Attributes:
+        log_lr: log LR to go on with: 0 where h1 was accepted, shape (...).
+        status: statuses, shape (...).
+        accepted: where h1 was accepted in this step (the first time or again), shape (...).
+        rejected: where h0 was accepted in this step, shape (...).
+    """
+
+    log_lr: Array
+    status: StatusArray
+    accepted: BoolArray
+    rejected: BoolArray
+
+
+def thresholds(p0: float, p1: float) -> Thresholds:
+    """Wald's thresholds (Eq. 14).
+
+    Args:
+        p0: probability of accepting h1 under h0.
+        p1: probability of accepting h1 under h1.
+
+    Returns:
+        log A and log B.
+
+    Raises:
+        ValueError: unless 0 < p0 < p1 < 1.
+    """
+    if not 0.0 < p0 < p1 < 1.0:
+        raise ValueError(f"p0 = {p0}, p1 = {p1}: 0 < p0 < p1 < 1 is needed, or log A < 0 < log B fails")
+    return Thresholds(float(np.log1p(-p1) - np.log1p(-p0)), float(np.log(p1) - np.log(p0)))
+
+
+def decide(log_lr: Array, status: StatusArray, limits: Thresholds) -> Verdict:
+    """One step of the test and of the monitoring that follows it (theory.md §7).
+
+    Above log B a track is confirmed and its LR starts anew at 1: from then on the test monitors it, deletes it below
+    log A, and resets again whenever it is confirmed anew.
+
+    Args:
+        log_lr: after the newest data, shape (...).
+        status: before, shape (...).
+        limits: log A, log B.
+
+    Returns:
+        what was decided.
+    """
+    alive = status != Status.DELETED
+    accepted = alive & (log_lr > limits.log_b)
+    rejected = alive & (log_lr < limits.log_a)
+    new = np.select([accepted, rejected], [Status.CONFIRMED, Status.DELETED], status).astype(np.uint8)
+    return Verdict(np.where(accepted, 0.0, log_lr), new, accepted, rejected)

@@ -1,0 +1,76 @@
+"""What reaches a process, in one queue: transport threads only put, the process's own thread works it off."""
+
+from __future__ import annotations
+
+import time
+from queue import Empty, SimpleQueue
+from typing import NamedTuple, TypeAlias
+
+
+class Heard(NamedTuple):
+    """Bytes came in on a key."""
+
+    key: str
+    payload: bytes
+
+
+class Present(NamedTuple):
+    """A liveliness token came or went."""
+
+    key: str
+    alive: bool
+
+
+class Missed(NamedTuple):
+    """Messages on a key are lost for good."""
+
+    key: str
+    count: int
+
+
+class Stopped(NamedTuple):
+    """The process shall end."""
+
+
+class Elapsed(NamedTuple):
+    """Nothing came in until the time asked for."""
+
+
+Incoming: TypeAlias = Heard | Present | Missed | Stopped | Elapsed
+
+
+class Inbox:
+    """A queue with one reader; everything else may be called from any thread, and from a signal handler."""
+
+    def __init__(self) -> None:
+        """Empty."""
+        self._queue: SimpleQueue[Incoming] = SimpleQueue()
+
+    def heard(self, key: str, payload: bytes) -> None:
+        """Put bytes."""
+        self._queue.put(Heard(key, payload))
+
+    def present(self, key: str, alive: bool) -> None:
+        """Put a change of liveliness."""
+        self._queue.put(Present(key, alive))
+
+    def missed(self, key: str, count: int) -> None:
+        """Put a loss."""
+        self._queue.put(Missed(key, count))
+
+    def stop(self) -> None:
+        """Put the request to end."""
+        self._queue.put(Stopped())
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing waits."""
+        return self._queue.empty()
+
+    def receive(self, until_ns: int | None) -> Incoming:
+        """The next thing that happens, at the latest at wall time ``until_ns``; None: however long it takes."""
+        try:
+            timeout = None if until_ns is None else max(0.0, (until_ns - time.time_ns()) / 1e9)
+            return self._queue.get(timeout=timeout)
+        except Empty:
+            return Elapsed()

@@ -1,0 +1,284 @@
+"""Every message and every key expression of the network, in one place.
+
+Times are integer nanoseconds since the Unix epoch. Arrays lead with T, the number of tracks. The sensor's name of a
+sensor's message is in its key, not in its payload.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from common.estimation.gaussian import Array, BoolArray, Gaussian
+from common.estimation.sprt import StatusArray
+
+IntArray = NDArray[np.int64]
+
+#: No report will follow: a source that is exhausted.
+NEVER = 2**63 - 1
+
+
+class Report(NamedTuple):
+    """What a sensor node says after one scan: the factor of every track it keeps.
+
+    A track's factor is a sum of terms ``e^g N(x; y, Y)`` (Eq. 17); the terms of all tracks stand one after the other.
+
+    Attributes:
+        sensor: who reports.
+        sequence: number of the report since the node started.
+        time_ns: time of the scan.
+        next_ns: no later report of this sensor will be about an earlier time; NEVER ends the series.
+        epoch: of the start message the factors descend from.
+        ids: tracks, ascending, shape (T,).
+        terms: number of terms of each track, shape (T,), sum N.
+        log_g: cumulative log p_bar (with one term) or log evidence g, shape (N,).
+        x: means, shape (N, n).
+        P: covariances, shape (N, n, n).
+    """
+
+    sensor: str
+    sequence: int
+    time_ns: int
+    next_ns: int
+    epoch: int
+    ids: IntArray
+    terms: IntArray
+    log_g: Array
+    x: Array
+    P: Array
+
+
+class Scan(NamedTuple):
+    """All plots of one sensor at one time; on the wire for display and recording.
+
+    Attributes:
+        sensor: who saw it.
+        time_ns: time of the scan.
+        position: where the sensor stood [m], shape (d,).
+        z: plots, shape (M, m).
+    """
+
+    sensor: str
+    time_ns: int
+    position: Array
+    z: Array
+
+
+class Join(NamedTuple):
+    """A sensor node is ready and asks for the tracks.
+
+    Attributes:
+        sensor: who joins.
+        incarnation: random number of the process: a restarted node has lost its factors, a reconnected one has not.
+        next_ns: no report of this sensor will be about an earlier time.
+    """
+
+    sensor: str
+    incarnation: int
+    next_ns: int
+
+
+class Start(NamedTuple):
+    """Tracks to keep from a time on; to a sensor that comes back, with the factors the center holds for it.
+
+    Attributes:
+        sensor: whom it concerns.
+        epoch: a node takes over a track it keeps already only from a higher epoch.
+        ids: tracks, ascending, shape (T,).
+        times_ns: times of the densities; scans later than this are used, shape (T,).
+        log_p_bar: cumulative log p_bar so far, shape (T,).
+        x, P: factors, shapes (T, n), (T, n, n).
+        x_a, P_a: association filters, same shapes.
+    """
+
+    sensor: str
+    epoch: int
+    ids: IntArray
+    times_ns: IntArray
+    log_p_bar: Array
+    x: Array
+    P: Array
+    x_a: Array
+    P_a: Array
+
+    @property
+    def factors(self) -> Gaussian:
+        """The factors."""
+        return Gaussian(self.x, self.P)
+
+    @property
+    def associations(self) -> Gaussian:
+        """The association filters."""
+        return Gaussian(self.x_a, self.P_a)
+
+
+class Stop(NamedTuple):
+    """Tracks that a sensor shall forget, ids of shape (T,)."""
+
+    sensor: str
+    ids: IntArray
+
+
+class Advice(NamedTuple):
+    """Fused tracks for the association filters (theory.md §6), shapes (T,), (T, n), (T, n, n)."""
+
+    time_ns: int
+    ids: IntArray
+    x: Array
+    P: Array
+
+
+class Clock(NamedTuple):
+    """How scenario time runs, for sources that have no clock of their own.
+
+    Attributes:
+        time_ns: measurement time ...
+        wall_ns: ... at this instant of the wall clock.
+        speed: seconds of measurement time per second; 0: lockstep, scans up to ``clear_ns`` may be processed.
+        clear_ns: the earliest time any sensor will report next; NEVER: all sources are exhausted.
+    """
+
+    time_ns: int
+    wall_ns: int
+    speed: float
+    clear_ns: int
+
+
+class Tracks(NamedTuple):
+    """The fused picture after all reports of one measurement time.
+
+    Attributes:
+        time_ns: the measurement time.
+        sensors: names of the sensors, in the order of ``contributing``.
+        ids: tracks, ascending, shape (T,); those deleted at this time for the last time.
+        status: 0 tentative, 1 confirmed, 2 deleted, shape (T,).
+        scans: measurement times used so far, shape (T,).
+        contributing: who reported the track at this time, shape (T, S).
+        log_lr: since the last reset, shape (T,).
+        log_lr_total: since the start, shape (T,).
+        x, P: fused densities, shapes (T, n), (T, n, n).
+    """
+
+    time_ns: int
+    sensors: tuple[str, ...]
+    ids: IntArray
+    status: StatusArray
+    scans: IntArray
+    contributing: BoolArray
+    log_lr: Array
+    log_lr_total: Array
+    x: Array
+    P: Array
+
+
+DecisionKind: TypeAlias = Literal["confirmed", "deleted", "withdrawn"]
+
+
+class Decision(NamedTuple):
+    """One decision about one track.
+
+    Attributes:
+        kind: confirmed, deleted, or withdrawn: a late report undid what was decided.
+        track: its id.
+        time_ns: measurement time of the data that decided.
+        log_lr: that crossed the threshold.
+        log_lr_total: sum of all log Lambda since the start.
+        scans: measurement times used since the start.
+    """
+
+    kind: DecisionKind
+    track: int
+    time_ns: int
+    log_lr: float
+    log_lr_total: float
+    scans: int
+
+
+Message: TypeAlias = Report | Scan | Join | Start | Stop | Advice | Clock | Tracks | Decision
+
+
+class Keys(NamedTuple):
+    """Key expressions of one network."""
+
+    network: str
+
+    def report(self, sensor: str = "*") -> str:
+        """Sensor node to center."""
+        return f"waldnet/{self.network}/sensor/{sensor}/report"
+
+    def plots(self, sensor: str = "*") -> str:
+        """Sensor node to whoever displays or records."""
+        return f"waldnet/{self.network}/sensor/{sensor}/plots"
+
+    def join(self, sensor: str = "*") -> str:
+        """Sensor node to center."""
+        return f"waldnet/{self.network}/sensor/{sensor}/join"
+
+    def about(self, sensor: str = "*") -> str:
+        """Queryable of a sensor node: its model as JSON."""
+        return f"waldnet/{self.network}/sensor/{sensor}/about"
+
+    def sensor_alive(self, sensor: str = "*") -> str:
+        """Liveliness token of a sensor node."""
+        return f"waldnet/{self.network}/alive/sensor/{sensor}"
+
+    def center_alive(self) -> str:
+        """Liveliness token of the center."""
+        return f"waldnet/{self.network}/alive/center"
+
+    def command(self, sensor: str = "*") -> str:
+        """Center to one node: start, stop."""
+        return f"waldnet/{self.network}/center/command/{sensor}"
+
+    def clock(self) -> str:
+        """Center to nodes."""
+        return f"waldnet/{self.network}/center/clock"
+
+    def advice(self) -> str:
+        """Center to nodes."""
+        return f"waldnet/{self.network}/center/advice"
+
+    def tracks(self) -> str:
+        """Center to all."""
+        return f"waldnet/{self.network}/center/tracks"
+
+    def decision(self) -> str:
+        """Center to all."""
+        return f"waldnet/{self.network}/center/decision"
+
+    def picture(self) -> str:
+        """Queryable of the center: the newest tracks."""
+        return f"waldnet/{self.network}/center/picture"
+
+    def of(self, message: Message) -> str:
+        """Where a message is published."""
+        match message:
+            case Report():
+                return self.report(message.sensor)
+            case Scan():
+                return self.plots(message.sensor)
+            case Join():
+                return self.join(message.sensor)
+            case Start() | Stop():
+                return self.command(message.sensor)
+            case Advice():
+                return self.advice()
+            case Clock():
+                return self.clock()
+            case Tracks():
+                return self.tracks()
+            case Decision():
+                return self.decision()
+
+
+def sensor_of(key: str) -> str:
+    """Name of the sensor that a key is about; empty for other keys."""
+    match key.split("/"):
+        case ["waldnet", _, "sensor", sensor, _] | ["waldnet", _, "center", "command", sensor]:
+            return sensor
+        case ["waldnet", _, "alive", "sensor", sensor]:
+            return sensor
+        case _:
+            return ""

@@ -1,0 +1,424 @@
+"""The center as a pure step: reports, joins and ticks in, messages out.
+
+Reports are worked in by measurement time, never by arrival. The pictures of the last few seconds are kept, so that a
+late report takes its place among the others and everything after it is computed anew: inside that window the result
+does not depend on the order of arrival.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from common.config import NS_PER_S, FusionConfig, Scenario
+from common.estimation.gaussian import Gaussian
+from common.estimation.sprt import Status
+from common.messages import NEVER, Advice, Clock, Decision, Join, Message, Report, Start, Stop, Tracks
+from fusion_center.picture import Fuser, Picture
+
+#: Wall time between the clock's announcement and its start: nodes on a slow link hear of it in time.
+_LEAD_NS = 50_000_000
+
+
+class Presence(NamedTuple):
+    """A sensor's liveliness token came or went."""
+
+    sensor: str
+    alive: bool
+
+
+class Tick(NamedTuple):
+    """Time has passed."""
+
+
+Event: TypeAlias = Report | Join | Presence | Tick
+
+
+class Member(NamedTuple):
+    """What the center knows of a sensor.
+
+    Attributes:
+        joined: it asked for the tracks.
+        alive: it is there now.
+        incarnation: of its process.
+        epoch: its reports must carry.
+        next_ns: nothing earlier will come from it.
+    """
+
+    joined: bool = False
+    alive: bool = False
+    incarnation: int = 0
+    epoch: int = 0
+    next_ns: int = 0
+
+
+class Checkpoint(NamedTuple):
+    """One measurement time, worked in."""
+
+    time_ns: int
+    reports: Mapping[int, Report]
+    picture: Picture
+    decisions: tuple[Decision, ...]
+
+
+class Waiting(NamedTuple):
+    """Reports of one measurement time not worked in yet.
+
+    Attributes:
+        reports: by number of the sensor.
+        since_ns: wall time of the first one's arrival.
+    """
+
+    reports: Mapping[int, Report]
+    since_ns: int
+
+
+class Counts(NamedTuple):
+    """What happened to reports that did not go the straight way.
+
+    Attributes:
+        late: worked in after their time, inside the window.
+        too_late: dropped, older than the window.
+        repeated: dropped, had arrived before.
+        refused: dropped, do not fit this network.
+    """
+
+    late: int = 0
+    too_late: int = 0
+    repeated: int = 0
+    refused: int = 0
+
+
+class State(NamedTuple):
+    """State of the center.
+
+    Attributes:
+        opened_ns: wall time of the first event: the wait for sensors counts from here.
+        clock: once running.
+        members: by number of the sensor.
+        waiting: by measurement time.
+        base: the picture before the oldest checkpoint.
+        base_ns: its time.
+        history: checkpoints inside the window, oldest first.
+        counts: of reports.
+    """
+
+    opened_ns: int
+    clock: Clock | None
+    members: tuple[Member, ...]
+    waiting: Mapping[int, Waiting]
+    base: Picture
+    base_ns: int
+    history: tuple[Checkpoint, ...]
+    counts: Counts
+
+    @property
+    def picture(self) -> Picture:
+        """The newest picture."""
+        return self.history[-1].picture if self.history else self.base
+
+    @property
+    def time_ns(self) -> int:
+        """The newest measurement time worked in."""
+        return self.history[-1].time_ns if self.history else self.base_ns
+
+    @property
+    def finished(self) -> bool:
+        """All sources are exhausted and everything is worked in."""
+        return self.clock is not None and self.clock.clear_ns == NEVER
+
+
+@dataclass(frozen=True)
+class Center:
+    """The steps of the center.
+
+    Attributes:
+        names: of the sensors.
+        fusion: hold-back, window, feedback.
+        fuser: moves the picture.
+        hypotheses: the tracks given by the scenario, as a picture.
+        epoch_ns: the instant of scenario time 0.
+        speed: seconds of measurement time per second, 0: lockstep.
+        wait_ns: how long to wait for all sensors before the clock starts.
+        first_epoch: later centers must use higher ones, so that nodes take over their tracks.
+    """
+
+    names: tuple[str, ...]
+    fusion: FusionConfig
+    fuser: Fuser
+    hypotheses: Picture
+    epoch_ns: int
+    speed: float
+    wait_ns: int
+    first_epoch: int
+
+    @classmethod
+    def of(cls, scenario: Scenario, *, speed: float = 0.0, wait_s: float = 10.0, first_epoch: int = 1) -> Center:
+        """The center of a scenario."""
+        fuser = Fuser.of(scenario)
+        picture = fuser.empty()
+        if scenario.hypotheses:
+            priors = [hypothesis.density for hypothesis in scenario.hypotheses]
+            picture = fuser.begin(
+                picture,
+                np.arange(len(priors)),
+                np.array([scenario.to_ns(hypothesis.start) for hypothesis in scenario.hypotheses]),
+                Gaussian(np.array([prior.x for prior in priors]), np.array([prior.P for prior in priors])),
+            )
+        return cls(
+            names=scenario.sensor_names,
+            fusion=scenario.fusion,
+            fuser=fuser,
+            hypotheses=picture,
+            epoch_ns=scenario.epoch_ns,
+            speed=speed,
+            wait_ns=round(wait_s * NS_PER_S),
+            first_epoch=first_epoch,
+        )
+
+    def initial(self, now_ns: int) -> State:
+        """A center that waits for its sensors."""
+        return State(
+            opened_ns=now_ns,
+            clock=None,
+            members=tuple(Member() for _ in self.names),
+            waiting={},
+            base=self.hypotheses,
+            base_ns=-NEVER,
+            history=(),
+            counts=Counts(),
+        )
+
+    def step(self, state: State, event: Event, now_ns: int) -> tuple[State, list[Message]]:
+        """Work in one event.
+
+        Args:
+            state: before.
+            event: what happened.
+            now_ns: wall time.
+
+        Returns:
+            the state after, and messages to publish in this order.
+        """
+        messages: list[Message] = []
+        match event:
+            case Join() if event.sensor in self.names:
+                state, messages = self._join(state, event)
+            case Presence() if event.sensor in self.names:
+                number = self.names.index(event.sensor)
+                state = _with_member(state, number, state.members[number]._replace(alive=event.alive))
+            case Report() if self._fits(state, event):
+                state, messages = self._accept(state, event, now_ns)
+            case Report() | Join():
+                state = _count(state, "refused")
+            case _:
+                pass
+        state, clock = self._begin(state, now_ns)
+        state, released = self._release(state, now_ns)
+        state, clear = self._clear(state)
+        return state, [*messages, *clock, *released, *clear]
+
+    def deadline_ns(self, state: State) -> int | None:
+        """Wall time at which a tick will change something; None: nothing is waited for."""
+        if state.clock is None:
+            return state.opened_ns + self.wait_ns
+        if not state.waiting or self.speed == 0.0:
+            return None
+        return state.waiting[min(state.waiting)].since_ns + self._hold_back_ns
+
+    @property
+    def _hold_back_ns(self) -> int:
+        return round(self.fusion.hold_back * NS_PER_S)
+
+    def _join(self, state: State, join: Join) -> tuple[State, list[Message]]:
+        """Answer a sensor with the tracks; one whose process is new gets its own last factors back."""
+        number = self.names.index(join.sensor)
+        member = state.members[number]
+        epoch = member.epoch
+        if not member.joined or join.incarnation != member.incarnation:
+            epoch = 1 + max(self.first_epoch, *(other.epoch for other in state.members))
+        member = Member(joined=True, alive=True, incarnation=join.incarnation, epoch=epoch, next_ns=join.next_ns)
+        state = _with_member(state, number, member)
+        answer: list[Message] = [self._start(state.picture, number, epoch)]
+        return state, [*answer, state.clock] if state.clock else answer
+
+    def _start(self, picture: Picture, number: int, epoch: int) -> Start:
+        """The live tracks for one sensor: its last factor where it reported one, else the prior.
+
+        A report is the whole state of a factor, so the center is every node's backup.
+        """
+        live = picture.status != Status.DELETED
+        held = picture.reported[:, number]
+        prior = self.fuser.share.start(Gaussian(picture.x0, picture.P0))
+        x = np.where(held[:, None], picture.x[:, number], prior.x)
+        P = np.where(held[:, None, None], picture.P[:, number], prior.P)
+        x_a = np.where(held[:, None], picture.fused_x, picture.x0)
+        P_a = np.where(held[:, None, None], picture.fused_P, picture.P0)
+        return Start(
+            sensor=self.names[number],
+            epoch=epoch,
+            ids=picture.ids[live],
+            times_ns=np.where(held, picture.times_ns, picture.starts_ns)[live],
+            log_p_bar=picture.log_p_bar[live, number],
+            x=x[live],
+            P=P[live],
+            x_a=x_a[live],
+            P_a=P_a[live],
+        )
+
+    def _fits(self, state: State, report: Report) -> bool:
+        """Whether a report comes from a sensor of this network and can be computed with."""
+        if report.sensor not in self.names:
+            return False
+        member = state.members[self.names.index(report.sensor)]
+        n = self.fuser.motion.n
+        if not member.joined or report.epoch != member.epoch or report.next_ns <= report.time_ns:
+            return False
+        if (len(report.ids) and report.x.shape[-1] != n) or (report.terms != 1).any():
+            return False
+        try:
+            np.linalg.cholesky(report.P)
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+    def _accept(self, state: State, report: Report, now_ns: int) -> tuple[State, list[Message]]:
+        number = self.names.index(report.sensor)
+        member = state.members[number]
+        # A report shows that its sensor is there, whatever became of its token.
+        state = _with_member(state, number, member._replace(alive=True, next_ns=max(member.next_ns, report.next_ns)))
+        if report.time_ns <= state.time_ns:
+            return self._late(state, number, report)
+        waiting = state.waiting.get(report.time_ns, Waiting({}, now_ns))
+        if number in waiting.reports:
+            return _count(state, "repeated"), []
+        waiting = waiting._replace(reports={**waiting.reports, number: report})
+        return state._replace(waiting={**state.waiting, report.time_ns: waiting}), []
+
+    def _late(self, state: State, number: int, report: Report) -> tuple[State, list[Message]]:
+        """Give a late report its place and compute anew from there on."""
+        if report.time_ns <= state.base_ns:
+            return _count(state, "too_late"), []
+        at = bisect_left(state.history, report.time_ns, key=lambda checkpoint: checkpoint.time_ns)
+        groups = {checkpoint.time_ns: checkpoint.reports for checkpoint in state.history[at:]}
+        group = groups.get(report.time_ns, {})
+        if number in group:
+            return _count(state, "repeated"), []
+        groups[report.time_ns] = {**group, number: report}
+        before = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
+        state = _count(state._replace(history=state.history[:at]), "late")
+        for time_ns in sorted(groups):
+            state = self._work_in(state, time_ns, groups[time_ns])
+        after = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
+        return state, [*_corrections(before, after), *self._publish(state)]
+
+    def _work_in(self, state: State, time_ns: int, reports: Mapping[int, Report]) -> State:
+        picture, decisions = self.fuser.advance(state.picture, time_ns, reports)
+        return state._replace(history=(*state.history, Checkpoint(time_ns, reports, picture, tuple(decisions))))
+
+    def _begin(self, state: State, now_ns: int) -> tuple[State, list[Message]]:
+        """Start the clock once all sensors are there, or after the wait with those that are."""
+        joined = [member for member in state.members if member.joined]
+        waited = now_ns - state.opened_ns >= self.wait_ns
+        if state.clock is not None or not joined or (len(joined) < len(self.names) and not waited):
+            return state, []
+        first_ns = min(member.next_ns for member in joined)
+        start_ns = self.epoch_ns if first_ns == NEVER else first_ns
+        clock = Clock(time_ns=start_ns, wall_ns=now_ns + _LEAD_NS, speed=self.speed, clear_ns=start_ns)
+        return state._replace(clock=clock), [clock]
+
+    def _release(self, state: State, now_ns: int) -> tuple[State, list[Message]]:
+        """Work in every measurement time for which nothing more is to be expected or waited for."""
+        messages: list[Message] = []
+        while state.clock is not None and state.waiting:
+            time_ns = min(state.waiting)
+            waiting = state.waiting[time_ns]
+            expected = any(member.alive and member.next_ns <= time_ns for member in state.members if member.joined)
+            overdue = self.speed > 0.0 and now_ns - waiting.since_ns >= self._hold_back_ns
+            if expected and not overdue:
+                break
+            rest = {time: group for time, group in state.waiting.items() if time != time_ns}
+            state = self._work_in(state._replace(waiting=rest), time_ns, waiting.reports)
+            messages += [*state.history[-1].decisions, *self._publish(state)]
+            state, stops = self._forget(state)
+            messages += stops
+        return state, messages
+
+    def _forget(self, state: State) -> tuple[State, list[Message]]:
+        """Let go of checkpoints older than the window; only now are their deletions final and the nodes told."""
+        oldest_ns = state.time_ns - round(self.fusion.window * NS_PER_S)
+        keep = bisect_left(state.history, oldest_ns, key=lambda checkpoint: checkpoint.time_ns)
+        keep = min(keep, len(state.history) - 1)
+        gone, state = state.history[:keep], state._replace(history=state.history[keep:])
+        if not gone:
+            return state, []
+        state = state._replace(base=gone[-1].picture, base_ns=gone[-1].time_ns)
+        deleted = [checkpoint.picture.ids[checkpoint.picture.status == Status.DELETED] for checkpoint in gone]
+        ids = np.unique(np.concatenate(deleted))
+        members = zip(self.names, state.members, strict=True)
+        return state, [Stop(name, ids) for name, member in members if member.joined and len(ids)]
+
+    def _clear(self, state: State) -> tuple[State, list[Message]]:
+        """Tell the nodes how far they may go in lockstep, and, at any speed, that all is done."""
+        if state.clock is None or state.waiting:
+            return state, []
+        joined = [member for member in state.members if member.joined]
+        nexts = [member.next_ns for member in joined if member.alive]
+        clear_ns = state.clock.clear_ns
+        if all(next_ns == NEVER for next_ns in nexts) and any(member.next_ns == NEVER for member in joined):
+            clear_ns = NEVER
+        elif self.speed == 0.0 and nexts:
+            clear_ns = min(nexts)
+        if clear_ns == state.clock.clear_ns:
+            return state, []
+        clock = state.clock._replace(clear_ns=clear_ns)
+        return state._replace(clock=clock), [clock]
+
+    def _publish(self, state: State) -> list[Message]:
+        """The newest picture, and advice where it is wanted."""
+        tracks = self.tracks(state)
+        if self.fusion.feedback == "none":
+            return [tracks]
+        live = tracks.status != Status.DELETED
+        return [tracks, Advice(tracks.time_ns, tracks.ids[live], tracks.x[live], tracks.P[live])]
+
+    def tracks(self, state: State) -> Tracks:
+        """The newest picture as a message: all tracks that have started."""
+        picture = state.picture
+        started = picture.starts_ns <= state.time_ns
+        return Tracks(
+            time_ns=state.time_ns,
+            sensors=self.names,
+            ids=picture.ids[started],
+            status=picture.status[started],
+            scans=picture.scans[started],
+            contributing=picture.contributing[started],
+            log_lr=picture.log_lr[started],
+            log_lr_total=picture.log_lr_total[started],
+            x=picture.fused_x[started],
+            P=picture.fused_P[started],
+        )
+
+
+def _with_member(state: State, number: int, member: Member) -> State:
+    members = (*state.members[:number], member, *state.members[number + 1 :])
+    return state._replace(members=members)
+
+
+def _count(state: State, what: str) -> State:
+    return state._replace(counts=state.counts._replace(**{what: getattr(state.counts, what) + 1}))
+
+
+def _corrections(before: list[Decision], after: list[Decision]) -> list[Message]:
+    """Decisions that a late report brought or undid."""
+
+    def name(decision: Decision) -> tuple[str, int, int]:
+        return decision.kind, decision.track, decision.time_ns
+
+    now, then = {name(decision) for decision in after}, {name(decision) for decision in before}
+    withdrawn = [decision._replace(kind="withdrawn") for decision in before if name(decision) not in now]
+    return [*withdrawn, *(decision for decision in after if name(decision) not in then)]

@@ -1,0 +1,255 @@
+"""The fused picture and how the reports of one measurement time move it (Eq. 9-11, 14)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from common.config import NS_PER_S, Scenario
+from common.estimation.batch import concatenate, put, take
+from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, product
+from common.estimation.motion import Motion
+from common.estimation.representation import Share, globalise, shrink
+from common.estimation.sensing import Sensor
+from common.estimation.sprt import Status, StatusArray, Thresholds, decide
+from common.messages import Decision, IntArray, Report
+
+
+class Picture(NamedTuple):
+    """All tracks of the center, one row a track; deleted ones leave at the next step.
+
+    Attributes:
+        ids: ascending, shape (T,).
+        starts_ns: start of the track, shape (T,).
+        x0, P0: prior at the start, shapes (T, n), (T, n, n).
+        times_ns: of the factors: the start, then the newest measurement time, shape (T,).
+        status: shape (T,).
+        scans: measurement times used, shape (T,).
+        log_lr: since the last reset, shape (T,).
+        log_lr_total: since the start, shape (T,).
+        log_p_bar: cumulative, as last reported, shape (T, S).
+        reported: which sensors ever reported the track, shape (T, S).
+        contributing: which sensors reported it at the newest time, shape (T, S).
+        x, P: factors, shapes (T, S, n), (T, S, n, n).
+        fused_x, fused_P: the product (Eq. 9), shapes (T, n), (T, n, n).
+        network_P: for ``dkf``, the covariances that follow from the models alone, like P; otherwise S = 0.
+    """
+
+    ids: IntArray
+    starts_ns: IntArray
+    x0: Array
+    P0: Array
+    times_ns: IntArray
+    status: StatusArray
+    scans: IntArray
+    log_lr: Array
+    log_lr_total: Array
+    log_p_bar: Array
+    reported: BoolArray
+    contributing: BoolArray
+    x: Array
+    P: Array
+    fused_x: Array
+    fused_P: Array
+    network_P: Array
+
+
+class Reported(NamedTuple):
+    """What the reports of one measurement time say about the tracks of a picture.
+
+    Attributes:
+        who: which sensors reported which track, shape (T, S).
+        log_p_bar: cumulative, shape (T, S); where nothing was reported, the last one.
+        x, P: factors, shapes (T, S, n), (T, S, n, n); where nothing was reported, the predicted ones.
+    """
+
+    who: BoolArray
+    log_p_bar: Array
+    x: Array
+    P: Array
+
+
+@dataclass(frozen=True)
+class Fuser:
+    """The steps of the picture.
+
+    Attributes:
+        motion: motion model.
+        sensors: models of the sensors, in the order of the scenario.
+        share: a sensor's share of prior and process noise.
+        limits: thresholds of the test, or None: nothing is decided.
+        globalised: predict as ``dkf`` does.
+    """
+
+    motion: Motion
+    sensors: tuple[Sensor, ...]
+    share: Share
+    limits: Thresholds | None
+    globalised: bool
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Fuser:
+        """The fuser of a scenario."""
+        motion = scenario.motion.build()
+        return cls(
+            motion=motion,
+            sensors=tuple(sensor.build(motion) for sensor in scenario.sensors),
+            share=scenario.share,
+            limits=scenario.decision.thresholds if scenario.decision.enabled else None,
+            globalised=scenario.fusion.mode == "dkf",
+        )
+
+    def empty(self) -> Picture:
+        """A picture without tracks."""
+        n, n_sensors = self.motion.n, len(self.sensors)
+        ints, floats = np.empty(0, np.int64), np.empty(0)
+        per_sensor = np.empty((0, n_sensors))
+        return Picture(
+            ids=ints,
+            starts_ns=ints,
+            x0=np.empty((0, n)),
+            P0=np.empty((0, n, n)),
+            times_ns=ints,
+            status=np.empty(0, np.uint8),
+            scans=ints,
+            log_lr=floats,
+            log_lr_total=floats,
+            log_p_bar=per_sensor,
+            reported=per_sensor.astype(np.bool_),
+            contributing=per_sensor.astype(np.bool_),
+            x=np.empty((0, n_sensors, n)),
+            P=np.empty((0, n_sensors, n, n)),
+            fused_x=np.empty((0, n)),
+            fused_P=np.empty((0, n, n)),
+            network_P=np.empty((0, n_sensors if self.globalised else 0, n, n)),
+        )
+
+    def begin(self, picture: Picture, ids: IntArray, times_ns: IntArray, priors: Gaussian) -> Picture:
+        """Add tracks that start with ``priors``, shapes (T, n), (T, n, n)."""
+        tracks, n_sensors = len(ids), len(self.sensors)
+        factor = self.share.start(priors)
+        P = np.repeat(factor.P[:, None], n_sensors, axis=1)
+        new = Picture(
+            ids=ids,
+            starts_ns=times_ns,
+            x0=priors.x,
+            P0=priors.P,
+            times_ns=times_ns,
+            status=np.full(tracks, Status.TENTATIVE, np.uint8),
+            scans=np.zeros(tracks, np.int64),
+            log_lr=np.zeros(tracks),
+            log_lr_total=np.zeros(tracks),
+            log_p_bar=np.zeros((tracks, n_sensors)),
+            reported=np.zeros((tracks, n_sensors), np.bool_),
+            contributing=np.zeros((tracks, n_sensors), np.bool_),
+            x=np.repeat(factor.x[:, None], n_sensors, axis=1),
+            P=P,
+            fused_x=priors.x,
+            fused_P=priors.P,
+            network_P=P if self.globalised else P[:, :0],
+        )
+        both = concatenate(picture, new)
+        return take(both, np.argsort(both.ids))
+
+    def advance(self, picture: Picture, t_ns: int, reports: Mapping[int, Report]) -> tuple[Picture, list[Decision]]:
+        """Work in all reports of one measurement time.
+
+        A sensor that is silent, or does not report a track, keeps its factor there, predicted, with p_bar = 1.
+
+        Args:
+            picture: at the measurement time before.
+            t_ns: the measurement time.
+            reports: by number of the sensor.
+
+        Returns:
+            the picture at ``t_ns`` and what was decided.
+        """
+        picture = take(picture, picture.status != Status.DELETED)
+        live = picture.times_ns < t_ns
+        moved = self._move(take(picture, live), t_ns, reports)
+        moved, decisions = self._decide(moved, t_ns)
+        return (moved if live.all() else put(picture, live, moved)), decisions
+
+    def _move(self, picture: Picture, t_ns: int, reports: Mapping[int, Report]) -> Picture:
+        predicted, network_P = self._predict(picture, t_ns)
+        said = _collect(picture, predicted, reports)
+        before = product(predicted)
+        after = product(Gaussian(said.x, said.P)) if said.who.any() else before
+        # Cumulative sums that are both -inf have not changed.
+        same = said.log_p_bar == picture.log_p_bar
+        evidence = np.where(same, 0.0, said.log_p_bar - np.where(same, 0.0, picture.log_p_bar)).sum(axis=-1)
+        log_lambda = _where_reported(said.who, after, before) + evidence
+        return picture._replace(
+            times_ns=np.full_like(picture.times_ns, t_ns),
+            scans=picture.scans + said.who.any(axis=-1),
+            log_lr=picture.log_lr + log_lambda,
+            log_lr_total=picture.log_lr_total + log_lambda,
+            log_p_bar=said.log_p_bar,
+            reported=picture.reported | said.who,
+            contributing=said.who,
+            x=said.x,
+            P=said.P,
+            fused_x=after.density.x,
+            fused_P=after.density.P,
+            network_P=self._shrunk(network_P, reports) if self.globalised else network_P,
+        )
+
+    def _predict(self, picture: Picture, t_ns: int) -> tuple[Gaussian, Array]:
+        """Predict all factors as their nodes do (Eq. 5; ``dkf``: with one covariance for all)."""
+        dt: Array = (t_ns - picture.times_ns) / NS_PER_S
+        if len(dt) and (dt == dt[0]).all():
+            dt = dt[:1]
+        factors = Gaussian(picture.x, picture.P)
+        if not self.globalised:
+            return self.share.predict(factors, self.motion, dt[:, None]), picture.network_P
+        common = globalise(picture.network_P)
+        P = np.repeat(common.P[:, None], len(self.sensors), axis=1)
+        predicted = self.share.predict(Gaussian(np.matvec(common.G, factors.x), P), self.motion, dt[:, None])
+        return predicted, predicted.P
+
+    def _shrunk(self, network_P: Array, reports: Mapping[int, Report]) -> Array:
+        network_P = network_P.copy()
+        for number in reports:
+            linear = self.sensors[number].measurement.linearise(
+                np.zeros(self.motion.n), np.zeros(self.motion.dimensions)
+            )
+            network_P[:, number] = shrink(network_P[:, number], linear.H, linear.R)
+        return network_P
+
+    def _decide(self, picture: Picture, t_ns: int) -> tuple[Picture, list[Decision]]:
+        if self.limits is None:
+            return picture, []
+        verdict = decide(picture.log_lr, picture.status, self.limits)
+        # Confirmed anew, a track only has its LR reset: that is monitoring, not a decision.
+        decisions = [
+            Decision(
+                kind="deleted" if verdict.rejected[row] else "confirmed",
+                track=int(picture.ids[row]),
+                time_ns=t_ns,
+                log_lr=float(picture.log_lr[row]),
+                log_lr_total=float(picture.log_lr_total[row]),
+                scans=int(picture.scans[row]),
+            )
+            for row in np.flatnonzero(verdict.status != picture.status)
+        ]
+        return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
+
+
+def _collect(picture: Picture, predicted: Gaussian, reports: Mapping[int, Report]) -> Reported:
+    """Lay the reports over the predicted factors; tracks that a report or the picture lacks are left alone."""
+    said = Reported(np.zeros_like(picture.reported), picture.log_p_bar.copy(), predicted.x.copy(), predicted.P.copy())
+    for number, report in reports.items():
+        _, rows, theirs = np.intersect1d(picture.ids, report.ids, assume_unique=True, return_indices=True)
+        said.who[rows, number] = True
+        said.log_p_bar[rows, number] = report.log_g[theirs]
+        said.x[rows, number] = report.x[theirs]
+        said.P[rows, number] = report.P[theirs]
+    return said
+
+
+def _where_reported(who: BoolArray, after: Product, before: Product) -> Array:
+    """``log c_after - log c_before``; exactly 0 for tracks nobody reported."""
+    return np.where(who.any(axis=-1), after.log_c - before.log_c, 0.0)

@@ -1,0 +1,1 @@
+"""Scenario files, recorded plots, and the simulation of truth and plots."""

@@ -1,0 +1,113 @@
+"""The simulated world: a function of the scenario and its seed.
+
+Every process derives the same truth from the seed, and its own plots from the seed and the sensor's name; so what
+``waldnet simulate`` writes is what the processes of ``waldnet run`` see.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from common.config import NS_PER_S, Scenario, SensorConfig, TargetConfig
+from common.errors import ConfigError
+from common.estimation.gaussian import Array
+from common.messages import IntArray, Scan
+
+
+class Truth(NamedTuple):
+    """True states.
+
+    Attributes:
+        times_ns: all scan times of the network, ascending, shape (K,).
+        x: states, shape (targets, K, n); NaN before a target's start.
+    """
+
+    times_ns: IntArray
+    x: Array
+
+
+def scan_times_ns(scenario: Scenario, sensor: SensorConfig) -> IntArray:
+    """Times of a simulated sensor's scans, shape (K,).
+
+    Raises:
+        ConfigError: when the scenario describes no simulation.
+    """
+    if scenario.simulation is None:
+        raise ConfigError(f"{scenario.name}: has no [simulation]; give recorded plots, or a duration to simulate")
+    first = sensor.scan_interval if sensor.first_scan is None else sensor.first_scan
+    # Half a nanosecond of slack: the last scan may fall on the end.
+    count = int(np.floor((scenario.simulation.duration - first) / sensor.scan_interval + 1e-9)) + 1
+    return np.array([scenario.to_ns(first + k * sensor.scan_interval) for k in range(max(count, 0))], np.int64)
+
+
+def truth(scenario: Scenario, seed: int) -> Truth:
+    """True states of all targets at all scan times of the network."""
+    per_sensor = [scan_times_ns(scenario, sensor) for sensor in scenario.sensors]
+    times_ns = np.unique(np.concatenate(per_sensor))
+    x = np.full((len(scenario.targets), len(times_ns), scenario.motion.build().n), np.nan)
+    for number, target in enumerate(scenario.targets):
+        rng = np.random.default_rng([seed, 1, number])
+        x[number] = _path(scenario, target, times_ns, rng)
+    return Truth(times_ns, x)
+
+
+def _path(scenario: Scenario, target: TargetConfig, times_ns: IntArray, rng: np.random.Generator) -> Array:
+    motion = scenario.motion.build()
+    path = np.full((len(times_ns), motion.n), np.nan)
+    state, now_ns = _first_state(scenario, target, rng), scenario.to_ns(target.start)
+    for k in np.flatnonzero(times_ns >= now_ns):
+        dt = np.array((times_ns[k] - now_ns) / NS_PER_S)
+        noise = rng.multivariate_normal(np.zeros(motion.n), motion.noise(dt), method="svd")
+        state = motion.transition(dt) @ state + noise
+        path[k], now_ns = state, int(times_ns[k])
+    return path
+
+
+def _first_state(scenario: Scenario, target: TargetConfig, rng: np.random.Generator) -> Array:
+    if target.state is not None:
+        return np.array(target.state)
+    assert target.hypothesis is not None
+    density = scenario.hypotheses[target.hypothesis].density
+    return rng.multivariate_normal(density.x, density.P)
+
+
+def simulate(scenario: Scenario, name: str, seed: int, world: Truth | None = None) -> list[Scan]:
+    """All scans of one simulated sensor.
+
+    Args:
+        scenario: the network and its world.
+        name: of the sensor.
+        seed: of everything random.
+        world: the truth, if it is at hand already.
+
+    Returns:
+        the scans, by time.
+    """
+    world = truth(scenario, seed) if world is None else world
+    config = scenario.sensor(name)
+    rng = np.random.default_rng([seed, 2, *name.encode()])
+    times_ns = scan_times_ns(scenario, config)
+    states = world.x[:, np.searchsorted(world.times_ns, times_ns)]
+    return [_scan(scenario, config, int(t_ns), states[:, k], rng) for k, t_ns in enumerate(times_ns)]
+
+
+def _scan(scenario: Scenario, config: SensorConfig, t_ns: int, states: Array, rng: np.random.Generator) -> Scan:
+    sensor = config.build(scenario.motion.build())
+    stand = config.stand(scenario.motion.dimensions)
+    center = config.view_center(stand)
+    there = states[~np.isnan(states).any(axis=-1)]
+    seen = sensor.field_of_view.contains(there[:, : len(stand)], center) & (rng.random(len(there)) < sensor.p_d)
+    linear = sensor.measurement.linearise(there[seen], stand)
+    noise = rng.multivariate_normal(np.zeros(sensor.measurement.m), linear.R, size=int(seen.sum()))
+    false = sensor.field_of_view.draw(rng, int(rng.poisson(sensor.false_plots)), center)
+    return Scan(config.name, t_ns, stand, rng.permutation(np.concatenate([linear.z + noise, false])))
+
+
+def simulate_all(scenario: Scenario, seed: int) -> list[Scan]:
+    """All scans of the network, by time; those of one time in the order of the sensors."""
+    world = truth(scenario, seed)
+    scans = [scan for name in scenario.sensor_names for scan in simulate(scenario, name, seed, world)]
+    return sorted(scans, key=lambda scan: scan.time_ns)
+

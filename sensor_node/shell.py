@@ -1,0 +1,201 @@
+"""The shell of a sensor node: reads bus and clock, calls the tracker's pure steps, writes the bus."""
+
+from __future__ import annotations
+
+import json
+import secrets
+import time
+from collections.abc import Sequence
+
+import structlog
+
+from common.codec import decode, encode
+from common.config import Network
+from common.errors import DecodeError, TransportError, VersionError
+from common.inbox import Elapsed, Heard, Inbox, Incoming, Missed, Present, Stopped
+from common.logs import Complaints
+from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Scan, Start, Stop
+from common.transport import Bus, Publisher
+from sensor_node.tracker import LocalTracker
+
+#: Between two requests to join while no center answers.
+_JOIN_EVERY_NS = 1_000_000_000
+
+
+class NodeShell:
+    """One sensor node on a bus; ``run`` blocks, ``stop`` may be called from anywhere, a signal handler too."""
+
+    def __init__(
+        self, bus: Bus, network: Network, tracker: LocalTracker, scans: Sequence[Scan], *, patience_s: float = 30.0
+    ) -> None:
+        """Take part in a network.
+
+        Args:
+            bus: where everything is heard and said.
+            network: for its name, and for errors.
+            tracker: the pure steps.
+            scans: what the sensor will see, by time.
+            patience_s: how long to wait for a center that was never heard of.
+        """
+        self._bus, self._network, self._tracker, self._scans = bus, network, tracker, scans
+        self._patience_ns = round(patience_s * 1e9)
+        self._name = tracker.config.name
+        self._log: structlog.typing.FilteringBoundLogger = structlog.get_logger().bind(sensor=self._name)
+        self.complaints = Complaints(self._log)
+        self._inbox = Inbox()
+        self._incarnation = secrets.randbits(62)
+        self._state = tracker.initial()
+        self._position = 0
+        self._clock: Clock | None = None
+        self._center = False
+        self._answered = self._stopped = False
+        self._began_ns = self._joined_ns = 0
+        self._keys = Keys(network.name)
+        self._publishers: dict[str, Publisher] = {}
+
+    def stop(self) -> None:
+        """End ``run`` soon."""
+        self._inbox.stop()
+
+    def run(self) -> None:
+        """Follow the center's clock through all scans, until they are worked in or ``stop`` is called.
+
+        Raises:
+            TransportError: no center answered within the patience.
+            VersionError: the center speaks another wire version.
+        """
+        self._open()
+        while not self._stopped and not self._done():
+            now = time.time_ns()
+            due = self._due_ns()
+            if self._inbox.empty and due is not None and due <= now:
+                self._process(self._scans[self._position])
+                continue
+            self._handle(self._inbox.receive(self._wake_ns(due, now)))
+        self._log.info("ended", scans=self._position, of=len(self._scans), dropped=dict(self.complaints.counts))
+
+    def _open(self) -> None:
+        for key in (self._keys.command(self._name), self._keys.clock(), self._keys.advice()):
+            self._bus.subscribe(key, self._inbox.heard, on_miss=self._inbox.missed)
+        self._publishers = {
+            self._keys.report(self._name): self._bus.publisher(self._keys.report(self._name)),
+            self._keys.join(self._name): self._bus.publisher(self._keys.join(self._name)),
+            self._keys.plots(self._name): self._bus.publisher(self._keys.plots(self._name), reliable=False),
+        }
+        about = json.dumps(self._tracker.config.model_dump(mode="json")).encode()
+        self._bus.answer(self._keys.about(self._name), lambda: about)
+        self._bus.announce(self._keys.sensor_alive(self._name))
+        self._bus.watch(self._keys.center_alive(), self._inbox.present)
+        self._began_ns = time.time_ns()
+
+    def _wake_ns(self, due_ns: int | None, now_ns: int) -> int | None:
+        """When to look up from the inbox; None: not before something comes in."""
+        if self._clock is None:
+            return now_ns + _JOIN_EVERY_NS
+        return due_ns
+
+    def _handle(self, incoming: Incoming) -> None:
+        match incoming:
+            case Heard(key, payload):
+                self._hear(key, payload)
+            case Present(_, alive):
+                self._center_changed(alive)
+            case Missed(key, count):
+                self.complaints.add("lost messages", key, count)
+            case Stopped():
+                self._stopped = True
+            case Elapsed():
+                self._ask_again()
+
+    def _center_changed(self, alive: bool) -> None:
+        if self._center and not alive:
+            self._log.warning("the center is gone; waiting for it to come back")
+        self._center = alive
+        if alive:
+            self._join()
+
+    def _ask_again(self) -> None:
+        """While no center has answered: ask again, and give up in the end."""
+        if self._answered:
+            return
+        waited = time.time_ns() - self._began_ns
+        if waited > self._patience_ns:
+            where = ", ".join((*self._network.connect, *self._network.listen)) or "no endpoint"
+            raise TransportError(
+                f"no center of network {self._network.name!r} answered {self._name!r} within {waited / 1e9:.0f} s "
+                f"({self._network.mode} at {where}): is it running, does its scenario have this sensor, and is the "
+                "network's name the same?"
+            )
+        if self._center:
+            self._join()
+
+    def _join(self) -> None:
+        if self._clock is None:
+            self._joined_ns = time.time_ns()
+        self._publish(Join(self._name, self._incarnation, self._next_ns()))
+
+    def _next_ns(self) -> int:
+        return self._scans[self._position].time_ns if self._position < len(self._scans) else NEVER
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        try:
+            message = decode(key, payload)
+        except VersionError as error:
+            raise VersionError(f"the center of this network and this node do not fit together: {error}") from None
+        except DecodeError as error:
+            self.complaints.add("bad bytes", str(error))
+            return
+        match message:
+            case Start():
+                self._answered = True
+                self._state = self._tracker.start(self._state, message)
+                self._log.info("tracks started", tracks=message.ids.tolist(), epoch=message.epoch)
+            case Stop():
+                self._state = self._tracker.stop(self._state, message)
+            case Advice():
+                self._state = self._tracker.advise(self._state, message)
+            case Clock():
+                self._set_clock(message)
+            case _:
+                self.complaints.add("unexpected", f"{key}: a {type(message).__name__} from the center")
+
+    def _set_clock(self, clock: Clock) -> None:
+        first = self._clock is None
+        self._clock = clock
+        if not first:
+            return
+        present_ns = clock.clear_ns
+        if clock.speed > 0.0:
+            # Whoever asked before the clock began sees everything; whoever comes later begins with the present.
+            late_ns = time.time_ns() - clock.wall_ns if self._joined_ns > clock.wall_ns else 0
+            present_ns = clock.time_ns + round(late_ns * clock.speed)
+        while self._position < len(self._scans) and self._scans[self._position].time_ns < present_ns:
+            self._position += 1
+        if self._position:
+            self._log.warning("joined late", skipped_scans=self._position)
+            self._join()
+
+    def _due_ns(self) -> int | None:
+        """Wall time at which the next scan may be processed; None: not known yet."""
+        if self._clock is None or self._position == len(self._scans):
+            return None
+        time_ns = self._scans[self._position].time_ns
+        if self._clock.speed > 0.0:
+            return self._clock.wall_ns + round((time_ns - self._clock.time_ns) / self._clock.speed)
+        return 0 if time_ns <= self._clock.clear_ns else None
+
+    def _process(self, scan: Scan) -> None:
+        self._position += 1
+        self._state, report = self._tracker.scan(self._state, scan, self._next_ns())
+        self._publish(report)
+        if self._publishers[self._keys.plots(self._name)].has_listeners:
+            self._publish(scan)
+
+    def _done(self) -> bool:
+        """All scans are sent, and the center has them all or is no more."""
+        if self._position < len(self._scans) or self._clock is None:
+            return False
+        return self._clock.clear_ns == NEVER or not self._center
+
+    def _publish(self, message: Message) -> None:
+        self._publishers[self._keys.of(message)].put(encode(message))

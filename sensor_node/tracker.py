@@ -1,0 +1,270 @@
+"""The local tracker of a sensor: pure steps from scans and commands to reports.
+
+State and events go in, state and messages come out; no clock, no network. A live process, a replay and a study run
+the same code.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from common.config import NS_PER_S, Scenario, SensorConfig
+from common.estimation.association import Clutter, Plots, pdaf, tight
+from common.estimation.batch import concatenate, put, take
+from common.estimation.gaussian import Array, Gaussian
+from common.estimation.motion import Motion
+from common.estimation.representation import Share, globalise, shrink
+from common.estimation.sensing import Sensor
+from common.messages import Advice, IntArray, Report, Scan, Start, Stop
+
+#: The honest prior and noise of the association filter.
+HONEST = Share(1.0)
+
+
+class Tracks(NamedTuple):
+    """What a node keeps of every track, one row a track.
+
+    Attributes:
+        ids: ascending, shape (T,).
+        times_ns: of the factors, shape (T,).
+        log_p_bar: cumulative since the start, shape (T,).
+        x, P: factors, shapes (T, n), (T, n, n).
+        times_a_ns: of the association filters, shape (T,).
+        x_a, P_a: association filters.
+        network_P: for ``dkf``, the covariances that all sensors' factors have by the models alone, shape
+            (T, S, n, n); otherwise S = 0.
+    """
+
+    ids: IntArray
+    times_ns: IntArray
+    log_p_bar: Array
+    x: Array
+    P: Array
+    times_a_ns: IntArray
+    x_a: Array
+    P_a: Array
+    network_P: Array
+
+
+class State(NamedTuple):
+    """State of a node.
+
+    Attributes:
+        epoch: of the newest start message.
+        sequence: number of the next report.
+        tracks: the tracks.
+        recent: scans of the last few seconds, oldest first, for tracks and advice that come late.
+    """
+
+    epoch: int
+    sequence: int
+    tracks: Tracks
+    recent: tuple[Scan, ...]
+
+
+class Schedule(NamedTuple):
+    """Scan times of the whole network, which ``dkf`` must know beforehand.
+
+    Attributes:
+        times_ns: ascending.
+        sensors: for every time, the numbers of the sensors that scan then.
+    """
+
+    times_ns: Sequence[int]
+    sensors: Sequence[tuple[int, ...]]
+
+
+@dataclass(frozen=True)
+class LocalTracker:
+    """The steps of one sensor's tracker.
+
+    Attributes:
+        motion: motion model.
+        config: the sensor as the scenario describes it.
+        sensor: the sensor model.
+        sensors: models of all sensors of the network.
+        number: of this sensor among them.
+        share: its share of prior and process noise.
+        tight: associate with a filter of its own (theory.md §5).
+        gate_probability: that the target's plot is inside the gate.
+        buffer_ns: how long scans are kept.
+        schedule: scan times of the network, only for ``dkf``.
+    """
+
+    motion: Motion
+    config: SensorConfig
+    sensor: Sensor
+    sensors: tuple[Sensor, ...]
+    number: int
+    share: Share
+    tight: bool
+    gate_probability: float
+    buffer_ns: int
+    schedule: Schedule | None
+
+    @classmethod
+    def of(cls, scenario: Scenario, name: str, schedule: Schedule | None = None) -> LocalTracker:
+        """The tracker of the named sensor of a scenario.
+
+        Raises:
+            ConfigError: when there is no such sensor.
+            ValueError: when the scenario's mode needs a schedule and there is none.
+        """
+        if scenario.fusion.mode == "dkf" and schedule is None:
+            raise ValueError("mode 'dkf' needs the scan times of all sensors beforehand")
+        motion = scenario.motion.build()
+        config = scenario.sensor(name)
+        sensors = tuple(sensor.build(motion) for sensor in scenario.sensors)
+        number = scenario.sensor_names.index(name)
+        return cls(
+            motion=motion,
+            config=config,
+            sensor=sensors[number],
+            sensors=sensors,
+            number=number,
+            share=scenario.share,
+            tight=scenario.fusion.association == "tight",
+            gate_probability=scenario.fusion.gate_probability,
+            buffer_ns=round(scenario.fusion.window * NS_PER_S),
+            schedule=schedule if scenario.fusion.mode == "dkf" else None,
+        )
+
+    def initial(self) -> State:
+        """A node that was told of no track yet."""
+        n = self.motion.n
+        network = len(self.sensors) if self.schedule else 0
+        none, x, P = np.empty(0, np.int64), np.empty((0, n)), np.empty((0, n, n))
+        tracks = Tracks(none, none, np.empty(0), x, P, none, x, P, np.empty((0, network, n, n)))
+        return State(epoch=0, sequence=0, tracks=tracks, recent=())
+
+    def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report]:
+        """Filter one scan and report every track that started before it."""
+        live = state.tracks.times_ns < scan.time_ns
+        filtered = self._filter(take(state.tracks, live), scan)
+        tracks = filtered if live.all() else put(state.tracks, live, filtered)
+        kept = tuple(old for old in state.recent if old.time_ns >= scan.time_ns - self.buffer_ns)
+        report = Report(
+            sensor=self.config.name,
+            sequence=state.sequence,
+            time_ns=scan.time_ns,
+            next_ns=next_ns,
+            epoch=state.epoch,
+            ids=filtered.ids,
+            terms=np.ones_like(filtered.ids),
+            log_g=filtered.log_p_bar,
+            x=filtered.x,
+            P=filtered.P,
+        )
+        return State(state.epoch, state.sequence + 1, tracks, (*kept, scan)), report
+
+    def start(self, state: State, start: Start) -> State:
+        """Take over tracks, and catch up on the scans since their start."""
+        known = np.isin(start.ids, state.tracks.ids) & (start.epoch <= state.epoch)
+        fresh = self._fresh(start, ~known)
+        for scan in state.recent:
+            due = fresh.times_ns < scan.time_ns
+            fresh = put(fresh, due, self._filter(take(fresh, due), scan))
+        stays = ~np.isin(state.tracks.ids, fresh.ids)
+        tracks = concatenate(take(state.tracks, stays), fresh)
+        tracks = take(tracks, np.argsort(tracks.ids))
+        return state._replace(epoch=max(state.epoch, start.epoch), tracks=tracks)
+
+    def stop(self, state: State, stop: Stop) -> State:
+        """Forget tracks."""
+        return state._replace(tracks=take(state.tracks, ~np.isin(state.tracks.ids, stop.ids)))
+
+    def advise(self, state: State, advice: Advice) -> State:
+        """Set the association filters to the fused tracks and redo the scans since (theory.md §6).
+
+        The factors never see the advice: nothing is counted twice.
+        """
+        tracks = state.tracks
+        _, mine, given = np.intersect1d(tracks.ids, advice.ids, assume_unique=True, return_indices=True)
+        x_a, P_a, times = tracks.x_a.copy(), tracks.P_a.copy(), tracks.times_a_ns.copy()
+        x_a[mine], P_a[mine], times[mine] = advice.x[given], advice.P[given], advice.time_ns
+        for scan in state.recent:
+            due = times < scan.time_ns
+            if due.any():
+                predicted = HONEST.predict(Gaussian(x_a[due], P_a[due]), self.motion, _interval(times[due], scan.time_ns))
+                linear = self.sensor.measurement.linearise(predicted.x, scan.position)
+                filtered = pdaf(predicted, _plots(scan), linear, self._clutter(predicted, scan))
+                (x_a[due], P_a[due]), times[due] = filtered.density, scan.time_ns
+        return state._replace(tracks=tracks._replace(x_a=x_a, P_a=P_a, times_a_ns=times))
+
+    def _fresh(self, start: Start, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Tracks:
+        network = len(self.sensors) if self.schedule else 0
+        network_P = np.repeat(start.P[:, None], network, axis=1)
+        tracks = Tracks(
+            start.ids,
+            start.times_ns,
+            start.log_p_bar,
+            start.x,
+            start.P,
+            start.times_ns,
+            start.x_a,
+            start.P_a,
+            network_P,
+        )
+        return take(tracks, rows)
+
+    def _filter(self, tracks: Tracks, scan: Scan) -> Tracks:
+        """Predict to the scan and filter it."""
+        factor, network_P = self._predict_factors(tracks, scan.time_ns)
+        linear = self.sensor.measurement.linearise(factor.x, scan.position)
+        association = Gaussian(tracks.x_a, tracks.P_a)
+        if self.tight:
+            association = HONEST.predict(association, self.motion, _interval(tracks.times_a_ns, scan.time_ns))
+            linear_a = self.sensor.measurement.linearise(association.x, scan.position)
+            clutter = self._clutter(association, scan)
+            filtered, association = tight(factor, association, _plots(scan), (linear, linear_a), clutter)
+        else:
+            filtered = pdaf(factor, _plots(scan), linear, self._clutter(factor, scan))
+        now = np.full_like(tracks.times_ns, scan.time_ns)
+        log_p_bar = tracks.log_p_bar + filtered.log_p_bar
+        return Tracks(tracks.ids, now, log_p_bar, *filtered.density, now, *association, network_P)
+
+    def _clutter(self, density: Gaussian, scan: Scan) -> Clutter:
+        center = self.config.view_center(scan.position)
+        p_d = self.sensor.detection_probability(density, center)
+        return Clutter(p_d, np.array(self.sensor.log_rho_f), self.gate_probability)
+
+    def _predict_factors(self, tracks: Tracks, t_ns: int) -> tuple[Gaussian, Array]:
+        factor = Gaussian(tracks.x, tracks.P)
+        if self.schedule is None:
+            return self.share.predict(factor, self.motion, _interval(tracks.times_ns, t_ns)), tracks.network_P
+        return self._predict_globalised(tracks, self.schedule, t_ns)
+
+    def _predict_globalised(self, tracks: Tracks, schedule: Schedule, t_ns: int) -> tuple[Gaussian, Array]:
+        """Predict as ``dkf`` does: at every scan of any sensor, make all covariances equal before the prediction.
+
+        What the other sensors' covariances are follows from the models and the schedule, never from data.
+        """
+        x, P, network_P, times = tracks.x.copy(), tracks.P.copy(), tracks.network_P.copy(), tracks.times_ns.copy()
+        first = bisect_right(schedule.times_ns, int(times.min(initial=t_ns)))
+        last = bisect_right(schedule.times_ns, t_ns)
+        for event_ns, scanning in zip(schedule.times_ns[first:last], schedule.sensors[first:last], strict=True):
+            due = times < event_ns
+            common = globalise(network_P[due])
+            x_own = np.matvec(common.G[:, self.number], x[due])
+            x[due], P[due] = self.share.predict(Gaussian(x_own, common.P), self.motion, _interval(times[due], event_ns))
+            network_P[due] = P[due][:, None]
+            for number in scanning:
+                linear = self.sensors[number].measurement.linearise(x[due], np.zeros(self.motion.dimensions))
+                network_P[due, number] = shrink(P[due], linear.H, linear.R)
+            times[due] = event_ns
+        return Gaussian(x, P), network_P
+
+
+def _interval(times_ns: IntArray, t_ns: int) -> Array:
+    """Seconds from ``times_ns`` to ``t_ns``, shape (T,); (1,) when all are equal, which saves T - 1 matrices."""
+    dt: Array = (t_ns - times_ns) / NS_PER_S
+    return dt[:1] if len(dt) and (dt == dt[0]).all() else dt
+
+
+def _plots(scan: Scan) -> Plots:
+    return Plots(scan.z, np.ones(len(scan.z), np.bool_))

@@ -1,0 +1,1 @@
+"""The network in one process: replay, the in-memory network, figures."""

@@ -59,7 +59,13 @@ _IDS = Block("ids", "<u4", ("T",), "i8")
 LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
     1: (
         Report,
-        (_IDS, Block("terms", "u1", ("T",), "i8"), _floats("log_g", "N"), _floats("x", "N", "n"), _floats("P", "N", "n^")),
+        (
+            _IDS,
+            Block("terms", "u1", ("T",), "i8"),
+            _floats("log_g", "N"),
+            _floats("x", "N", "n"),
+            _floats("P", "N", "n^"),
+        ),
     ),
     2: (Scan, (_floats("position", "d"), _floats("z", "M", "m"))),
     3: (Join, ()),
@@ -118,7 +124,7 @@ def encode(message: Message) -> bytes:
         if block.axes[-1].endswith("^"):
             array = array[..., *_upper(array.shape[-1])]
         raw.append(np.ascontiguousarray(array, dtype=block.dtype).tobytes())
-    scalars = [getattr(message, name) for name, _ in _scalars(type(message))]
+    scalars = [getattr(message, name) for name, _ in _scalars(kind)]
     return bytes(msgpack.packb([VERSION, kind, scalars, list(sizes.values()), b"".join(raw)]))
 
 
@@ -159,7 +165,7 @@ def _decode_body(sensor: str, body: list[Any]) -> Message:
     if not _is_int(kind) or kind not in LAYOUTS:
         raise DecodeError(f"kind {kind!r} is unknown")
     message, layout = LAYOUTS[kind]
-    fields = _decode_scalars(message, scalars)
+    fields = _decode_scalars(message, _scalars(kind), scalars)
     fields.update(_decode_blocks(layout, sizes, blocks))
     if message in _KEYED:
         if not sensor:
@@ -170,8 +176,7 @@ def _decode_body(sensor: str, body: list[Any]) -> Message:
     return decoded
 
 
-def _decode_scalars(message: type, scalars: Any) -> dict[str, Any]:
-    expected = _scalars(message)
+def _decode_scalars(message: type, expected: tuple[tuple[str, str], ...], scalars: Any) -> dict[str, Any]:
     if not isinstance(scalars, list) or len(scalars) != len(expected):
         raise DecodeError(f"expected the {len(expected)} scalars of a {message.__name__}")
     fields: dict[str, Any] = {}
@@ -253,9 +258,10 @@ def _check(message: Message) -> None:
 
 
 @cache
-def _scalars(message: type) -> tuple[tuple[str, str], ...]:
-    """Names and types of the scalar fields of a message, in order."""
-    blocks = {block.field for block in LAYOUTS[_KINDS[message]][1]}
+def _scalars(kind: int) -> tuple[tuple[str, str], ...]:
+    """Names and types of the scalar fields of a kind of message, in order."""
+    message, layout = LAYOUTS[kind]
+    blocks = {block.field for block in layout}
     names = {int: "int", float: "float", tuple[str, ...]: "tuple"}
     return tuple(
         (name, names.get(hint, "str"))

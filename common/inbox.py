@@ -25,7 +25,14 @@ class Missed(NamedTuple):
     """Messages on a key are lost for good."""
 
     key: str
-    count: int
+    number: int
+
+
+class Exited(NamedTuple):
+    """A child process ended."""
+
+    name: str
+    code: int
 
 
 class Stopped(NamedTuple):
@@ -36,7 +43,7 @@ class Elapsed(NamedTuple):
     """Nothing came in until the time asked for."""
 
 
-Incoming: TypeAlias = Heard | Present | Missed | Stopped | Elapsed
+Incoming: TypeAlias = Heard | Present | Missed | Exited | Stopped | Elapsed
 
 
 class Inbox:
@@ -54,9 +61,13 @@ class Inbox:
         """Put a change of liveliness."""
         self._queue.put(Present(key, alive))
 
-    def missed(self, key: str, count: int) -> None:
+    def missed(self, key: str, number: int) -> None:
         """Put a loss."""
-        self._queue.put(Missed(key, count))
+        self._queue.put(Missed(key, number))
+
+    def exited(self, name: str, code: int) -> None:
+        """Put the end of a child process."""
+        self._queue.put(Exited(name, code))
 
     def stop(self) -> None:
         """Put the request to end."""

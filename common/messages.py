@@ -134,8 +134,8 @@ class Clock(NamedTuple):
     """How scenario time runs, for sources that have no clock of their own.
 
     Attributes:
-        time_ns: measurement time ...
-        wall_ns: ... at this instant of the wall clock.
+        time_ns: measurement time at ``wall_ns``; in lockstep the newest one worked in.
+        wall_ns: instant of the wall clock.
         speed: seconds of measurement time per second; 0: lockstep, scans up to ``clear_ns`` may be processed.
         clear_ns: the earliest time any sensor will report next; NEVER: all sources are exhausted.
     """

@@ -368,14 +368,14 @@ class Center:
             return state, []
         joined = [member for member in state.members if member.joined]
         nexts = [member.next_ns for member in joined if member.alive]
-        clear_ns = state.clock.clear_ns
+        time_ns, clear_ns = state.clock.time_ns, state.clock.clear_ns
         if all(next_ns == NEVER for next_ns in nexts) and any(member.next_ns == NEVER for member in joined):
             clear_ns = NEVER
         elif self.speed == 0.0 and nexts:
-            clear_ns = min(nexts)
+            time_ns, clear_ns = max(time_ns, state.time_ns), min(nexts)
         if clear_ns == state.clock.clear_ns:
             return state, []
-        clock = state.clock._replace(clear_ns=clear_ns)
+        clock = state.clock._replace(time_ns=time_ns, clear_ns=clear_ns)
         return state._replace(clock=clock), [clock]
 
     def _publish(self, state: State) -> list[Message]:

@@ -9,11 +9,11 @@ import structlog
 from common.codec import decode, encode
 from common.config import Network, Scenario
 from common.errors import DecodeError
-from common.inbox import Elapsed, Heard, Inbox, Incoming, Missed, Present, Stopped
+from common.inbox import Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Decision, Join, Keys, Message, Report, Tracks, sensor_of
 from common.transport import Bus, Publisher
-from fusion_center.center import Center, Event, Presence, State, Tick
+from fusion_center.center import Center, Event, Presence, Tick
 
 #: How long a finished center stays for nodes that have not heard of the end yet.
 _LINGER_NS = 2_000_000_000
@@ -76,11 +76,11 @@ class CenterShell:
             case Present(key, alive):
                 self._step(Presence(sensor_of(key), alive))
                 self._say_presence(sensor_of(key), alive)
-            case Missed(key, count):
-                self.complaints.add("lost reports", f"{key}: the next one restores their evidence", count)
+            case Missed(key, number):
+                self.complaints.add("lost reports", f"{key}: the next one restores their evidence", number)
             case Stopped():
                 self._stopped = True
-            case Elapsed():
+            case _:
                 self._step(Tick())
 
     def _hear(self, key: str, payload: bytes) -> None:

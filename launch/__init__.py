@@ -1,1 +1,1 @@
-"""."""
+"""The command line ``waldnet``, and the launcher of a network on one machine."""

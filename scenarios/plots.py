@@ -7,7 +7,7 @@ sensor's own measurement space; a sensor that moves gives its ``position``.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -49,7 +49,9 @@ def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
             scan = _parse(line, scenario)
             before = first_line.setdefault((scan.sensor, scan.time_ns), number)
             if before != number:
-                raise ValueError(f"{scan.sensor} has a scan at {scenario.to_seconds(scan.time_ns)} s already, line {before}")
+                raise ValueError(
+                    f"{scan.sensor} has a scan at {scenario.to_seconds(scan.time_ns)} s already, line {before}"
+                )
         except ValueError as error:
             raise PlotsError(f"{path}:{number}: {error}") from None
         scans.append(scan)
@@ -109,8 +111,3 @@ def _numbers(value: Any, size: int, where: str) -> Array:
 
 def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-
-
-def of_sensor(scans: Sequence[Scan], name: str) -> list[Scan]:
-    """The scans of one sensor."""
-    return [scan for scan in scans if scan.sensor == name]

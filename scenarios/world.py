@@ -110,4 +110,3 @@ def simulate_all(scenario: Scenario, seed: int) -> list[Scan]:
     world = truth(scenario, seed)
     scans = [scan for name in scenario.sensor_names for scan in simulate(scenario, name, seed, world)]
     return sorted(scans, key=lambda scan: scan.time_ns)
-

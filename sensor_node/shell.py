@@ -12,7 +12,7 @@ import structlog
 from common.codec import decode, encode
 from common.config import Network
 from common.errors import DecodeError, TransportError, VersionError
-from common.inbox import Elapsed, Heard, Inbox, Incoming, Missed, Present, Stopped
+from common.inbox import Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Scan, Start, Stop
 from common.transport import Bus, Publisher
@@ -47,6 +47,7 @@ class NodeShell:
         self._state = tracker.initial()
         self._position = 0
         self._clock: Clock | None = None
+        self._advised_ns: int | None = None
         self._center = False
         self._answered = self._stopped = False
         self._began_ns = self._joined_ns = 0
@@ -90,7 +91,7 @@ class NodeShell:
 
     def _wake_ns(self, due_ns: int | None, now_ns: int) -> int | None:
         """When to look up from the inbox; None: not before something comes in."""
-        if self._clock is None:
+        if not self._answered:
             return now_ns + _JOIN_EVERY_NS
         return due_ns
 
@@ -100,11 +101,11 @@ class NodeShell:
                 self._hear(key, payload)
             case Present(_, alive):
                 self._center_changed(alive)
-            case Missed(key, count):
-                self.complaints.add("lost messages", key, count)
+            case Missed(key, number):
+                self.complaints.add("lost messages", key, number)
             case Stopped():
                 self._stopped = True
-            case Elapsed():
+            case _:
                 self._ask_again()
 
     def _center_changed(self, alive: bool) -> None:
@@ -154,6 +155,7 @@ class NodeShell:
                 self._state = self._tracker.stop(self._state, message)
             case Advice():
                 self._state = self._tracker.advise(self._state, message)
+                self._advised_ns = message.time_ns
             case Clock():
                 self._set_clock(message)
             case _:
@@ -164,6 +166,8 @@ class NodeShell:
         self._clock = clock
         if not first:
             return
+        if self._tracker.advised:
+            self._advised_ns = clock.time_ns
         present_ns = clock.clear_ns
         if clock.speed > 0.0:
             # Whoever asked before the clock began sees everything; whoever comes later begins with the present.
@@ -177,12 +181,14 @@ class NodeShell:
 
     def _due_ns(self) -> int | None:
         """Wall time at which the next scan may be processed; None: not known yet."""
-        if self._clock is None or self._position == len(self._scans):
+        # Start and clock come on different keys, in any order: a report needs both.
+        if self._clock is None or not self._answered or self._position == len(self._scans):
             return None
         time_ns = self._scans[self._position].time_ns
         if self._clock.speed > 0.0:
             return self._clock.wall_ns + round((time_ns - self._clock.time_ns) / self._clock.speed)
-        return 0 if time_ns <= self._clock.clear_ns else None
+        advised = self._advised_ns is None or self._advised_ns >= self._clock.time_ns
+        return 0 if advised and time_ns <= self._clock.clear_ns else None
 
     def _process(self, scan: Scan) -> None:
         self._position += 1

@@ -2,15 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 from common.config import Scenario
 from common.errors import ConfigError
 from common.messages import Scan
-from scenarios.plots import of_sensor, read_plots
-from scenarios.world import simulate_all
+from scenarios.plots import in_order, read_plots
+from scenarios.world import scan_times_ns, simulate, simulate_all
 from sensor_node.tracker import Schedule
+
+
+class Source(NamedTuple):
+    """What one sensor sees, and when all of them look.
+
+    Attributes:
+        scans: of the sensor, by time.
+        schedule: of the whole network.
+    """
+
+    scans: list[Scan]
+    schedule: Schedule
+
+
+def recording_of(scenario: Scenario, plots: Path | None) -> Path | None:
+    """The recording to use: the one given, else the scenario's, else none: the world is simulated.
+
+    Raises:
+        ConfigError: when there is nothing to see.
+    """
+    if plots is None and scenario.recording is not None:
+        return scenario.recording.plots
+    if plots is None and scenario.simulation is None:
+        raise ConfigError(f"{scenario.name}: has neither [recording] nor [simulation], and no plots were given")
+    return plots
+
+
+def seed_of(scenario: Scenario, seed: int | None) -> int:
+    """The seed given, else the scenario's."""
+    return seed if seed is not None else scenario.simulation.seed if scenario.simulation else 0
 
 
 def all_scans(scenario: Scenario, *, plots: Path | None = None, seed: int | None = None) -> list[Scan]:
@@ -25,21 +56,28 @@ def all_scans(scenario: Scenario, *, plots: Path | None = None, seed: int | None
         ConfigError: when there is nothing to see.
         PlotsError: when the recording is wrong.
     """
-    if plots is None and scenario.recording is not None:
-        plots = scenario.recording.plots
-    if plots is not None:
-        return read_plots(plots, scenario)
-    if scenario.simulation is None:
-        raise ConfigError(f"{scenario.name}: has neither [recording] nor [simulation], and no plots were given")
-    return simulate_all(scenario, scenario.simulation.seed if seed is None else seed)
+    recording = recording_of(scenario, plots)
+    return simulate_all(scenario, seed_of(scenario, seed)) if recording is None else read_plots(recording, scenario)
 
 
-def schedule_of(scans: Sequence[Scan], scenario: Scenario) -> Schedule:
-    """Who scans when, in scans ordered by time."""
-    times: dict[int, list[int]] = {}
-    for scan in scans:
-        times.setdefault(scan.time_ns, []).append(scenario.sensor_names.index(scan.sensor))
-    return Schedule(list(times), [tuple(numbers) for numbers in times.values()])
+def source(scenario: Scenario, name: str, *, plots: Path | None = None, seed: int | None = None) -> Source:
+    """What the named sensor sees; arguments and errors as for ``all_scans``."""
+    recording = recording_of(scenario, plots)
+    if recording is None:
+        times = ((int(t), i) for i, sensor in enumerate(scenario.sensors) for t in scan_times_ns(scenario, sensor))
+        return Source(simulate(scenario, name, seed_of(scenario, seed)), _schedule(sorted(times)))
+    scans = read_plots(recording, scenario)
+    return Source([scan for scan in scans if scan.sensor == name], schedule_of(scans, scenario))
 
 
-__all__ = ["all_scans", "of_sensor", "schedule_of"]
+def schedule_of(scans: Iterable[Scan], scenario: Scenario) -> Schedule:
+    """Who scans when, in recorded scans."""
+    ordered = in_order(scans, scenario)
+    return _schedule((scan.time_ns, scenario.sensor_names.index(scan.sensor)) for scan in ordered)
+
+
+def _schedule(times: Iterable[tuple[int, int]]) -> Schedule:
+    groups: dict[int, list[int]] = {}
+    for t_ns, number in times:
+        groups.setdefault(t_ns, []).append(number)
+    return Schedule(list(groups), [tuple(numbers) for numbers in groups.values()])

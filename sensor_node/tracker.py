@@ -91,6 +91,7 @@ class LocalTracker:
         number: of this sensor among them.
         share: its share of prior and process noise.
         tight: associate with a filter of its own (theory.md §5).
+        advised: the fused track comes back as advice (theory.md §6).
         gate_probability: that the target's plot is inside the gate.
         buffer_ns: how long scans are kept.
         schedule: scan times of the network, only for ``dkf``.
@@ -103,6 +104,7 @@ class LocalTracker:
     number: int
     share: Share
     tight: bool
+    advised: bool
     gate_probability: float
     buffer_ns: int
     schedule: Schedule | None
@@ -129,6 +131,7 @@ class LocalTracker:
             number=number,
             share=scenario.share,
             tight=scenario.fusion.association == "tight",
+            advised=scenario.fusion.feedback == "advice",
             gate_probability=scenario.fusion.gate_probability,
             buffer_ns=round(scenario.fusion.window * NS_PER_S),
             schedule=schedule if scenario.fusion.mode == "dkf" else None,
@@ -190,7 +193,9 @@ class LocalTracker:
         for scan in state.recent:
             due = times < scan.time_ns
             if due.any():
-                predicted = HONEST.predict(Gaussian(x_a[due], P_a[due]), self.motion, _interval(times[due], scan.time_ns))
+                predicted = HONEST.predict(
+                    Gaussian(x_a[due], P_a[due]), self.motion, _interval(times[due], scan.time_ns)
+                )
                 linear = self.sensor.measurement.linearise(predicted.x, scan.position)
                 filtered = pdaf(predicted, _plots(scan), linear, self._clutter(predicted, scan))
                 (x_a[due], P_a[due]), times[due] = filtered.density, scan.time_ns

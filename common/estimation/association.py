@@ -17,6 +17,7 @@ from common.estimation.gaussian import (
     Array,
     BoolArray,
     Gaussian,
+    cholesky,
     half_log_det,
     log_sum_exp,
     symmetric,
@@ -91,7 +92,7 @@ def innovate(predicted: Gaussian, z: Array, sensor: Linearised) -> Innovations:
         the innovations.
     """
     PH = predicted.P @ sensor.H.mT
-    L = np.linalg.cholesky(symmetric(sensor.H @ PH) + sensor.R)
+    L = cholesky(symmetric(sensor.H @ PH) + sensor.R)
     L_plot = L[..., None, :, :]
     w = whiten(L_plot, z - sensor.z[..., None, :])
     distance = np.vecdot(w, w)

@@ -42,6 +42,16 @@ def symmetric(P: Array) -> Array:
     return 0.5 * (P + P.mT)
 
 
+def cholesky(P: Array) -> Array:
+    """Lower Cholesky factors of ``P``, shape (..., n, n).
+
+    Raises:
+        numpy.linalg.LinAlgError: when a matrix is not positive definite.
+    """
+    L: Array = np.linalg.cholesky(P).astype(np.float64, copy=False)
+    return L
+
+
 def whiten(L: Array, d: Array) -> Array:
     """Solve ``L w = d`` by forward substitution.
 
@@ -79,9 +89,10 @@ def log_pdf(at: Array, density: Gaussian) -> Array:
     Returns:
         log density, shape (...).
     """
-    L = np.linalg.cholesky(density.P)
+    L = cholesky(density.P)
     w = whiten(L, at - density.x)
-    return -0.5 * np.vecdot(w, w) - half_log_det(L) - 0.5 * LOG_2PI * L.shape[-1]
+    result: Array = -0.5 * np.vecdot(w, w) - half_log_det(L) - 0.5 * LOG_2PI * L.shape[-1]
+    return result
 
 
 def product(factors: Gaussian, members: BoolArray | None = None) -> Product:
@@ -105,15 +116,15 @@ def product(factors: Gaussian, members: BoolArray | None = None) -> Product:
         theory.md Eq. (8), (9); N. Carlson, Federated square root filter (1990).
     """
     n = factors.x.shape[-1]
-    share = np.ones(factors.x.shape[:-1]) if members is None else members.astype(np.float64)
-    L = np.linalg.cholesky(factors.P)
+    share: Array = np.ones(factors.x.shape[:-1]) if members is None else members.astype(np.float64)
+    L = cholesky(factors.P)
     # Rows of W: the columns of L^-1, so that P^-1 = W W'.
     W = whiten(L[..., None, :, :], np.eye(n))
     information = np.einsum("...s,...sik,...sjk->...ij", share, W, W)
     # Relative to the first factor, so that large coordinates cost no digits.
     reference = factors.x[..., :1, :]
     v = np.einsum("...s,...sik,...sk->...i", share, W, whiten(L, factors.x - reference))
-    C = np.linalg.cholesky(information)
+    C = cholesky(information)
     V = whiten(C[..., None, :, :], np.eye(n))
     P = V @ V.mT
     x = reference[..., 0, :] + np.matvec(P, v)
@@ -144,4 +155,5 @@ def log_sum_exp(log_weights: Array) -> Array:
     top = log_weights.max(axis=-1, keepdims=True)
     safe = np.where(np.isfinite(top), top, 0.0)
     total = np.exp(log_weights - safe).sum(axis=-1)
-    return np.log(total, out=np.full_like(total, -np.inf), where=total > 0.0) + safe[..., 0]
+    result: Array = np.log(total, out=np.full_like(total, -np.inf), where=total > 0.0) + safe[..., 0]
+    return result

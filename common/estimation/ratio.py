@@ -27,4 +27,5 @@ def log_lambda(before: Gaussian, after: Gaussian, log_p_bar: Array, members: Boo
     """
     share = np.ones(log_p_bar.shape) if members is None else members.astype(np.float64)
     evidence = np.where(share > 0.0, log_p_bar, 0.0).sum(axis=-1)
-    return product(after, members).log_c - product(before, members).log_c + evidence
+    result: Array = product(after, members).log_c - product(before, members).log_c + evidence
+    return result

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array, Gaussian, symmetric, whiten
+from common.estimation.gaussian import Array, Gaussian, cholesky, symmetric, whiten
 from common.estimation.motion import Motion, predict
 
 
@@ -65,9 +65,9 @@ def globalise(P: Array) -> Global:
         theory.md §4; F. Govaers, Sequential likelihood ratio test based on the distributed Kalman filter (2015).
     """
     n_sensors, n = P.shape[-3], P.shape[-1]
-    W = whiten(np.linalg.cholesky(P)[..., None, :, :], np.eye(n))
+    W = whiten(cholesky(P)[..., None, :, :], np.eye(n))
     information = W @ W.mT
-    V = whiten(np.linalg.cholesky(information.sum(axis=-3))[..., None, :, :], np.eye(n))
+    V = whiten(cholesky(information.sum(axis=-3))[..., None, :, :], np.eye(n))
     common = symmetric(n_sensors * (V @ V.mT))
     return Global(common, common[..., None, :, :] @ information)
 
@@ -84,5 +84,5 @@ def shrink(P: Array, H: Array, R: Array) -> Array:
         updated covariances, shape (..., n, n).
     """
     PH = P @ H.mT
-    W = whiten(np.linalg.cholesky(symmetric(H @ PH) + R)[..., None, :, :], PH)
+    W = whiten(cholesky(symmetric(H @ PH) + R)[..., None, :, :], PH)
     return symmetric(P - W @ W.mT)

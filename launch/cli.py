@@ -1,0 +1,180 @@
+"""The command line ``waldnet``."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import nullcontext
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import App, Parameter
+
+from common.config import Network, Scenario, load_scenario
+from common.estimation.sprt import Status
+from common.logs import LogFormat, configure
+from common.messages import Tracks
+from common.process import Speed
+from common.process import main as run_app
+from fusion_center.app import center
+from scenarios.catalogue import find, names
+from sensor_node.app import node
+
+app = App(name="waldnet", help="Sensors decide together, by Wald's sequential test, which tracks are real.")
+app.command(node)
+app.command(center)
+
+
+@app.command
+def run(
+    scenario: str,
+    *,
+    plots: Path | None = None,
+    seed: int | None = None,
+    speed: Speed = 1.0,
+    out: Path | None = None,
+) -> None:
+    """Run all processes of a network on this machine, and write a report.
+
+    Args:
+        scenario: scenario file, or name of one that comes along (see: waldnet scenarios).
+        plots: recorded plots (JSON Lines) instead of the scenario's.
+        seed: of the simulated world, instead of the scenario's.
+        speed: seconds of measurement time per second; max: as fast as all go together.
+        out: folder of the report; default runs/SCENARIO-TIME.
+    """
+    from rich.console import Console
+
+    from launch.run import Order, execute
+    from sensor_node.sources import all_scans, seed_of
+
+    path = find(scenario)
+    loaded = load_scenario(path)
+    plots = plots.resolve() if plots else None
+    scans = all_scans(loaded, plots=plots, seed=seed)
+    stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
+    order = Order(
+        scenario=loaded,
+        path=path.resolve(),
+        plots=plots,
+        seed=seed_of(loaded, seed),
+        speed=speed,
+        out=out or Path("runs") / f"{loaded.name}-{stamp}",
+        end_ns=scans[-1].time_ns if scans else loaded.epoch_ns,
+    )
+    execute(order, Console(stderr=False, highlight=False))
+
+
+@app.command
+def replay(
+    scenario: str, plots: Path | None = None, *, as_json: Annotated[bool, Parameter(name="--json", negative=())] = False
+) -> None:
+    """Work through recorded plots in one process, deterministically and without a network.
+
+    Args:
+        scenario: scenario file, or name of one that comes along.
+        plots: recorded plots (JSON Lines); default: the scenario's recording, or its simulated world.
+        as_json: print one JSON line per track and measurement time, and nothing else.
+    """
+    from sensor_node.sources import all_scans
+    from studies.lines import TrackLines
+    from studies.replay import Replay
+
+    loaded = load_scenario(find(scenario))
+    lines = TrackLines(loaded)
+    final: dict[int, str] = {}
+    for message in Replay(loaded, all_scans(loaded, plots=plots)).run():
+        if isinstance(message, Tracks) and as_json:
+            sys.stdout.writelines(line + "\n" for line in lines.of(message))
+        elif isinstance(message, Tracks):
+            for row, track in enumerate(message.ids):
+                status = Status(message.status[row]).name.lower()
+                final[int(track)] = f"track {track}: {status}, log LR in total {message.log_lr_total[row]:+.2f}"
+        elif not as_json:
+            time_s = loaded.to_seconds(message.time_ns)
+            print(f"{time_s:8.2f} s  track {message.track} {message.kind}, log LR {message.log_lr:+.2f}")
+    if not as_json:
+        print("\n".join(text for _, text in sorted(final.items())))
+
+
+@app.command
+def simulate(scenario: str, *, seed: int | None = None, out: Path | None = None) -> None:
+    """Write the plots of a simulated world as JSON Lines: those that the processes of ``waldnet run`` will see.
+
+    Args:
+        scenario: scenario file, or name of one that comes along.
+        seed: of everything random, instead of the scenario's.
+        out: file to write; default standard output.
+    """
+    from scenarios.plots import write_plots
+    from scenarios.world import simulate_all
+    from sensor_node.sources import seed_of
+
+    loaded = load_scenario(find(scenario))
+    scans = simulate_all(loaded, seed_of(loaded, seed))
+    with out.open("w", encoding="utf-8") if out else nullcontext(sys.stdout) as file:
+        write_plots(file, scans, loaded)
+
+
+@app.command
+def check(scenario: str, plots: Path | None = None) -> None:
+    """Validate a scenario file, and its recorded plots if it has any.
+
+    Args:
+        scenario: scenario file, or name of one that comes along.
+        plots: recorded plots to validate too, instead of the scenario's.
+    """
+    from scenarios.plots import read_plots
+
+    loaded = load_scenario(find(scenario))
+    fusion = loaded.fusion
+    print(
+        f"{loaded.name}: {len(loaded.sensors)} sensors, {len(loaded.hypotheses)} hypotheses, {len(loaded.targets)} "
+        f"simulated targets; {fusion.mode}, association {fusion.association}, feedback {fusion.feedback}"
+    )
+    recording = plots or (loaded.recording.plots if loaded.recording else None)
+    if recording is not None:
+        scans = read_plots(recording, loaded)
+        print(f"{recording}: {len(scans)} scans, {sum(len(scan.z) for scan in scans)} plots")
+
+
+@app.command
+def router(
+    *, listen: Annotated[tuple[str, ...], Parameter(negative=())] = ("tcp/127.0.0.1:7447",), log: LogFormat = "auto"
+) -> None:
+    """Run a Zenoh router, to which nodes and center connect as clients (--mode client).
+
+    Args:
+        listen: endpoint to listen on; may be given several times. tcp/0.0.0.0:7447 is open to all hosts.
+        log: how to log to standard error.
+    """
+    from threading import Event
+
+    from common.process import stopped_by_signals
+    from common.transport import open_zenoh
+
+    configure(log)
+    ended = Event()
+    with open_zenoh(Network(mode="router", listen=listen)) as bus, stopped_by_signals(ended.set):
+        print(json.dumps({"listening": bus.endpoints()}), flush=True)
+        ended.wait()
+
+
+@app.command
+def scenarios() -> None:
+    """List the scenarios that come along."""
+    for name in names():
+        first = find(name).read_text(encoding="utf-8").splitlines()[0]
+        print(f"{name:18} {first.lstrip('# ')}")
+
+
+@app.command
+def schema() -> None:
+    """Print the JSON Schema of scenario files, for editors."""
+    print(json.dumps(Scenario.model_json_schema(by_alias=True), indent=2))
+
+
+def main() -> None:
+    """Entry point of ``waldnet``."""
+    run_app(app)

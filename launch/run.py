@@ -1,0 +1,171 @@
+"""``waldnet run``: all processes of a network on this machine."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+
+from common.codec import decode
+from common.config import Network, Scenario
+from common.errors import DecodeError
+from common.inbox import Exited, Heard, Inbox, Incoming, Present, Stopped
+from common.messages import NEVER, Clock, Decision, Keys, Tracks, sensor_of
+from common.process import stopped_by_signals
+from common.transport import Bus, open_zenoh
+from launch.processes import Children, LaunchError, describe_exit
+from launch.status import LiveStatus
+from studies.record import Record, write_report
+
+CENTER = "center"
+#: Once all children have ended: time for what is still on its way to the launcher.
+_LAST_WORDS_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to run.
+
+    Attributes:
+        scenario: as loaded.
+        path: its file.
+        plots: recorded plots instead of the scenario's.
+        seed: of the simulated world.
+        speed: seconds of measurement time per second, 0: lockstep.
+        out: folder of the report.
+        end_ns: time of the last scan.
+    """
+
+    scenario: Scenario
+    path: Path
+    plots: Path | None
+    seed: int
+    speed: float
+    out: Path
+    end_ns: int
+
+
+class Run:
+    """One run: starts the processes, watches them and the network, and tells how it ended."""
+
+    def __init__(self, order: Order, console: Console) -> None:
+        """Set up; nothing is started yet."""
+        self._order = order
+        self._inbox = Inbox()
+        self.record = Record(order.scenario)
+        self._status = LiveStatus(self.record, order.end_ns, console)
+        self._children = Children(order.out / "logs", self._inbox.exited)
+        self._keys = Keys(order.scenario.network.name)
+        self._finished = self._stopped = False
+
+    def run(self) -> None:
+        """Run to the end of all sources, or until stopped.
+
+        Raises:
+            LaunchError: the center did not start or died, or all sensors died.
+        """
+        listen = Network(name=self._keys.network, listen=("tcp/127.0.0.1:0",))
+        with stopped_by_signals(self._inbox.stop), open_zenoh(listen) as bus:
+            try:
+                self._start_all(bus)
+                self._watch(bus)
+                with self._status:
+                    self._follow()
+                    self._follow_up(bus)
+            finally:
+                self._children.end()
+
+    def _start_all(self, bus: Bus) -> None:
+        order, here = self._order, bus.endpoints()
+        same = ["--network-name", self._keys.network]
+        speed = str(order.speed) if order.speed else "max"
+        to_here = [word for endpoint in here for word in ("--connect", endpoint)]
+        listening = ["--listen", "tcp/127.0.0.1:0", "--mode", "peer"]
+        self._children.start(CENTER, "fusion_center", [str(order.path), *same, *to_here, *listening, "--speed", speed])
+        at = [word for endpoint in self._children.first_line(CENTER)["listening"] for word in ("--connect", endpoint)]
+        source = ["--seed", str(order.seed), *(["--plots", str(order.plots)] if order.plots else [])]
+        for name in order.scenario.sensor_names:
+            connect = [*at, *to_here, "--mode", "peer"]
+            self._children.start(name, "sensor_node", [str(order.path), name, *same, *connect, *source])
+
+    def _watch(self, bus: Bus) -> None:
+        for key in (self._keys.tracks(), self._keys.decision(), self._keys.clock()):
+            bus.subscribe(key, self._inbox.heard, history=200)
+        bus.subscribe(self._keys.plots(), self._inbox.heard, reliable=False)
+        bus.watch(self._keys.sensor_alive(), self._inbox.present)
+
+    def _follow(self) -> None:
+        """Until all children have ended by themselves, or must be ended."""
+        until_ns: int | None = None
+        while not self._stopped:
+            if until_ns is None and not self._children.running():
+                until_ns = time.time_ns() + _LAST_WORDS_NS
+            if until_ns is not None and (self._finished or time.time_ns() >= until_ns):
+                return
+            self._work_off(self._inbox.receive(until_ns))
+
+    def _follow_up(self, bus: Bus) -> None:
+        """What had arrived by the end: keys are read side by side, the end may overtake the last picture."""
+        bus.close()
+        while not self._inbox.empty:
+            self._work_off(self._inbox.receive(None))
+
+    def _work_off(self, incoming: Incoming) -> None:
+        match incoming:
+            case Heard(key, payload):
+                self._hear(key, payload)
+            case Present(key, alive):
+                self._status.present(sensor_of(key), alive)
+            case Exited(name, code):
+                self._child_ended(name, code)
+            case Stopped():
+                self._stopped = True
+                self._status.say("stopped", "yellow")
+            case _:
+                pass
+
+    def _hear(self, key: str, payload: bytes) -> None:
+        try:
+            message = decode(key, payload)
+        except DecodeError as error:
+            self._status.say(str(error), "yellow")
+            return
+        self.record.note(message)
+        match message:
+            case Tracks():
+                self._status.picture(message)
+            case Decision():
+                self._status.decided(message)
+            case Clock():
+                self._finished = message.clear_ns == NEVER
+            case _:
+                pass
+
+    def _child_ended(self, name: str, code: int) -> None:
+        how = describe_exit(code)
+        if name == CENTER:
+            if code != 0 or not (self._finished or self._stopped):
+                raise LaunchError(f"the fusion center died ({how}): {self._children.last_words(CENTER)}")
+        elif code != 0:
+            why = f"{how}: {self._children.last_words(name)}" if code > 0 else how
+            self.record.lost[name] = why
+            self._status.say(f"sensor {name} died ({why}); the run goes on with the others", "bold red")
+            if set(self.record.lost) == set(self._order.scenario.sensor_names):
+                raise LaunchError("all sensors died; the logs in the report folder say why")
+
+
+def execute(order: Order, console: Console) -> None:
+    """Run and write the report, whatever the end.
+
+    Raises:
+        LaunchError: the run failed; what was heard until then is in the report.
+    """
+    order.out.mkdir(parents=True, exist_ok=True)
+    run = Run(order, console)
+    try:
+        run.run()
+    finally:
+        files = write_report(run.record, order.out, {"seed": order.seed, "speed": order.speed or "max"})
+        console.print(f"report: {', '.join(str(file) for file in files)}", highlight=False, soft_wrap=True)

@@ -1,0 +1,12 @@
+"""``python -m sensor_node SCENARIO SENSOR``."""
+
+from cyclopts import App
+
+from common.process import main
+from sensor_node.app import node
+
+app = App(name="sensor_node", help="One sensor node.")
+app.default(node)
+
+if __name__ == "__main__":
+    main(app)

@@ -1,0 +1,48 @@
+"""Command line of a sensor node."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from common.config import load_scenario
+from common.logs import LogFormat, configure
+from common.process import NetworkOptions, stopped_by_signals
+from common.transport import open_zenoh
+from scenarios.catalogue import find
+from sensor_node.shell import NodeShell
+from sensor_node.sources import source
+from sensor_node.tracker import LocalTracker
+
+
+def node(
+    scenario: str,
+    sensor: str,
+    *,
+    options: NetworkOptions | None = None,
+    plots: Path | None = None,
+    seed: int | None = None,
+    patience: float = 30.0,
+    log: LogFormat = "auto",
+    with_parent: bool = False,
+) -> None:
+    """Run one sensor: filter its scans and report to the fusion center.
+
+    Args:
+        scenario: scenario file, or name of one that comes along.
+        sensor: name of the sensor in the scenario.
+        options: the network.
+        plots: recorded plots (JSON Lines) instead of the scenario's.
+        seed: of the simulated world, instead of the scenario's.
+        patience: seconds to wait for a center before giving up.
+        log: how to log to standard error; auto: colour on a terminal, JSON elsewhere.
+        with_parent: end when standard input closes.
+    """
+    configure(log)
+    loaded = load_scenario(find(scenario))
+    seen = source(loaded, loaded.sensor(sensor).name, plots=plots, seed=seed)
+    tracker = LocalTracker.of(loaded, sensor, seen.schedule)
+    network = (options or NetworkOptions()).over(loaded)
+    with open_zenoh(network) as bus:
+        shell = NodeShell(bus, network, tracker, seen.scans, patience_s=patience)
+        with stopped_by_signals(shell.stop, with_parent=with_parent):
+            shell.run()

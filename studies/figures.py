@@ -1,0 +1,163 @@
+"""Figures of a run: log LR over time with both thresholds, and the plan view."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Ellipse, Patch, Rectangle
+from matplotlib.text import Annotation
+
+from common.config import BoxConfig, DiscConfig, SensorConfig
+from common.estimation.gaussian import Array
+from common.estimation.sprt import Status
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from studies.record import History, Record
+
+COLOUR = {Status.TENTATIVE: "#8a6d1a", Status.CONFIRMED: "#0b7a3b", Status.DELETED: "#b3261e"}
+_SENSOR = "#1f4e9e"
+#: Covariance ellipses of a track, at most.
+_ELLIPSES = 12
+#: 95 % of a 2-D Gaussian lie within this many standard deviations.
+_RADIUS_95 = 2.4477
+
+
+def draw_log_lr(record: Record, path: Path) -> None:
+    """Log LR of every track over time, as the test sees it: with its resets, between log A and log B."""
+    figure = Figure(figsize=(13, 6), layout="constrained")
+    FigureCanvasAgg(figure)
+    decided, whole = figure.subplots(1, 2, sharey=True)
+    curves = {track: (*_with_resets(record, track, h), h) for track, h in record.histories().items()}
+    first = {d.track: record.scenario.to_seconds(d.time_ns) for d in reversed(record.standing())}
+    for track, (times, log_lr, history) in curves.items():
+        colour = COLOUR[Status(int(history.status[-1]))]
+        # The value that decided stands before the reset at the same time.
+        until = int(np.searchsorted(times, first[track])) + 1 if track in first else len(times)
+        decided.plot(times[:until], log_lr[:until], color=colour, lw=1.5)
+        _label(decided, f" {track}", (times[:until][-1], log_lr[:until][-1]), colour)
+        whole.plot(times, log_lr, color=colour, lw=0.7)
+    for axes in (decided, whole):
+        _draw_test(axes, record)
+    decided.set(ylabel="log LR since the last reset", title=f"{record.scenario.name}: until the first decision")
+    whole.set(title="the whole run: confirmed tracks are monitored, their LR reset at log B")
+    if first:
+        start_s = min(times[0] for times, _, _ in curves.values())
+        decided.set_xlim(start_s, start_s + 1.15 * (max(first.values()) - start_s))
+    decided.legend(handles=_status_handles(record), fontsize=9, loc="upper left")
+    figure.savefig(path, dpi=110)
+
+
+def _draw_test(axes: Axes, record: Record) -> None:
+    """Thresholds and decisions."""
+    limits = record.scenario.decision.thresholds
+    for decision in record.standing():
+        confirmed = decision.kind == "confirmed"
+        colour = COLOUR[Status.CONFIRMED if confirmed else Status.DELETED]
+        time_s = record.scenario.to_seconds(decision.time_ns)
+        axes.plot(time_s, max(decision.log_lr, -1e3), marker="^" if confirmed else "v", color=colour, ms=8)
+    for value, name in ((limits.log_b, "log B: confirm"), (limits.log_a, "log A: delete")):
+        axes.axhline(value, color="black", ls="--", lw=1)
+        axes.annotate(name, (1, value), xycoords=("axes fraction", "data"), ha="right", va="bottom", fontsize=9)
+    axes.axhline(0, color="0.8", lw=0.8, zorder=0)
+    axes.set(xlabel="time [s]")
+
+
+def _label(axes: Axes, text: str, at: tuple[float, float], colour: str) -> None:
+    """Annotate a point; labels at one and the same point are joined."""
+    for other in axes.texts:
+        if isinstance(other, Annotation) and np.allclose(other.xy, at, rtol=0.0, atol=0.25):
+            other.set_text(f"{other.get_text()},{text}")
+            return
+    axes.annotate(text, at, color=colour, fontsize=9, va="center")
+
+
+def draw_plan(record: Record, path: Path) -> None:
+    """Sensors with their fields of view, plots, tracks with 95 % ellipses, east and north."""
+    figure = Figure(figsize=(9, 9), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    plots = [scan.z[:, :2] for scan in record.scans if len(scan.z)]
+    if plots:
+        points = np.concatenate(plots)
+        axes.plot(points[:, 0], points[:, 1], ".", ms=2.5, color="0.72", label=f"{len(points)} plots", zorder=1)
+    for sensor in record.scenario.sensors:
+        _draw_sensor(axes, record, sensor)
+    for track, history in record.histories().items():
+        _draw_track(axes, track, history)
+    handles = [*axes.get_legend_handles_labels()[0], *_status_handles(record)]
+    axes.legend(handles=handles, fontsize=9, loc="upper right")
+    axes.set(xlabel="east [m]", ylabel="north [m]", title=f"{record.scenario.name}: plan view, 95 % ellipses")
+    axes.set_aspect("equal", adjustable="datalim")
+    figure.savefig(path, dpi=120)
+
+
+def _with_resets(record: Record, track: int, history: History) -> tuple[Array, Array]:
+    """Times and log LR with the value that each reset, at a confirmation, threw away."""
+    step = np.diff(history.log_lr_total, prepend=0.0)
+    before = np.concatenate([[0.0], history.log_lr[:-1]])
+    start_s = record.scenario.hypotheses[track].start if track < len(record.scenario.hypotheses) else history.times_s[0]
+    with np.errstate(invalid="ignore"):
+        reached = np.nan_to_num(before + step, nan=-1e3, neginf=-1e3)
+    times = np.concatenate([[start_s], np.repeat(history.times_s, 2)])
+    values = np.stack([reached, np.maximum(history.log_lr, -1e3)], axis=-1).ravel()
+    return times, np.concatenate([[0.0], values])
+
+
+def _draw_sensor(axes: Axes, record: Record, sensor: SensorConfig) -> None:
+    stands = np.array([scan.position[:2] for scan in record.scans if scan.sensor == sensor.name])
+    if not len(stands):
+        stands = sensor.stand(record.scenario.motion.dimensions)[None, :2]
+    axes.plot(stands[:, 0], stands[:, 1], color=_SENSOR, lw=1.5)
+    label = "sensors" if sensor is record.scenario.sensors[0] else None
+    axes.plot(*stands[-1], marker="s", color=_SENSOR, ms=7, ls="", zorder=5, label=label)
+    if len(record.scenario.sensors) <= 8:
+        offset = (0, 8 + 11 * _namesakes(record, sensor, stands[-1]))
+        axes.annotate(sensor.name, stands[-1], xytext=offset, textcoords="offset points", color=_SENSOR, ha="center")
+    center = sensor.view_center(stands[-1])[:2]
+    style: dict[str, Any] = {"fill": False, "ec": _SENSOR, "alpha": 0.35, "ls": ":"}
+    view = sensor.field_of_view
+    if isinstance(view, BoxConfig):
+        size = np.array(view.size[:2])
+        axes.add_patch(Rectangle(tuple(center - size / 2), *size, **style))
+    elif isinstance(view, DiscConfig):
+        axes.add_patch(Circle(tuple(center), view.radius, **style))
+
+
+def _namesakes(record: Record, sensor: SensorConfig, stand: Array) -> int:
+    """How many earlier sensors stand at nearly the same place: their names must not cover each other."""
+    before = record.scenario.sensors[: record.scenario.sensors.index(sensor)]
+    last = {scan.sensor: scan.position[:2] for scan in record.scans}
+    dimensions = record.scenario.motion.dimensions
+    places = [last.get(other.name, other.stand(dimensions)[:2]) for other in before]
+    return sum(bool(np.hypot(*(place - stand)) < 50.0) for place in places)
+
+
+def _draw_track(axes: Axes, track: int, history: History) -> None:
+    colour = COLOUR[Status(int(history.status[-1]))]
+    axes.plot(history.x[:, 0], history.x[:, 1], color=colour, lw=1.5, zorder=3)
+    ellipses = min(_ELLIPSES, max(2, len(history.x) // 3))
+    for k in np.unique(np.linspace(0, len(history.x) - 1, ellipses).astype(int)):
+        axes.add_patch(_ellipse(history.x[k, :2], history.P[k, :2, :2], colour))
+    axes.annotate(f" {track}", tuple(history.x[-1, :2]), color=colour, fontsize=10, zorder=6)
+
+
+def _ellipse(center: Array, P: Array, colour: str) -> Ellipse:
+    variances, axes = np.linalg.eigh(P)
+    width, height = 2.0 * _RADIUS_95 * np.sqrt(variances)
+    angle = float(np.degrees(np.arctan2(axes[1, 0], axes[0, 0])))
+    return Ellipse(tuple(center), width, height, angle=angle, fill=False, ec=colour, alpha=0.6, zorder=4)
+
+
+def _status_handles(record: Record) -> list[Patch]:
+    there = [Status(int(history.status[-1])) for history in record.histories().values()]
+    return [
+        Patch(color=COLOUR[status], label=f"{there.count(status)} {status.name.lower()}")
+        for status in (Status.CONFIRMED, Status.TENTATIVE, Status.DELETED)
+        if status in there
+    ]

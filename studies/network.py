@@ -1,0 +1,66 @@
+"""The in-memory network: the same shells as the processes, on threads and a bus within one process."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+
+from common.codec import decode
+from common.config import Scenario
+from common.inbox import Heard, Inbox
+from common.messages import Keys, Scan
+from common.transport import MemoryNetwork
+from fusion_center.center import Center
+from fusion_center.shell import CenterShell
+from sensor_node.shell import NodeShell
+from sensor_node.sources import schedule_of
+from sensor_node.tracker import LocalTracker
+from studies.record import Record
+
+
+def run_in_memory(scenario: Scenario, scans: Sequence[Scan], *, speed: float = 0.0) -> Record:
+    """Run a whole network on threads of this process, codec and bus included.
+
+    Args:
+        scenario: the network.
+        scans: all scans, by time.
+        speed: seconds of measurement time per second; 0: lockstep.
+
+    Returns:
+        everything that was published.
+    """
+    memory, heard = MemoryNetwork(), Inbox()
+    keys = Keys(scenario.network.name)
+    schedule = schedule_of(scans, scenario)
+    with memory.bus() as listener, memory.bus() as center_bus:
+        for key in (keys.tracks(), keys.decision(), keys.plots()):
+            listener.subscribe(key, heard.heard)
+        buses = {name: memory.bus() for name in scenario.sensor_names}
+        center = CenterShell(center_bus, scenario.network, scenario, Center.of(scenario, speed=speed))
+        nodes = [
+            NodeShell(
+                bus,
+                scenario.network,
+                LocalTracker.of(scenario, name, schedule),
+                [scan for scan in scans if scan.sensor == name],
+            )
+            for name, bus in buses.items()
+        ]
+        shells: list[CenterShell | NodeShell] = [center, *nodes]
+        with ThreadPoolExecutor(len(shells)) as pool:
+            running = [pool.submit(shell.run) for shell in shells]
+            done, _ = wait(running, return_when=FIRST_EXCEPTION)
+            for shell in shells:
+                shell.stop()
+            for future in done:
+                future.result()
+        for bus in buses.values():
+            bus.close()
+    record = Record(scenario)
+    while not heard.empty:
+        match heard.receive(None):
+            case Heard(key, payload):
+                record.note(decode(key, payload))
+            case _:
+                pass
+    return record

@@ -1,0 +1,179 @@
+"""Scenarios, worlds and reports for tests."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from common.config import NS_PER_S, Scenario
+from common.messages import NEVER, Clock, Decision, Join, Message, Report, Scan, Start, Tracks
+from fusion_center.center import Center, Event, Tick
+from fusion_center.center import State as CenterState
+from sensor_node.tracker import LocalTracker
+from sensor_node.tracker import State as NodeState
+
+BOX = {"shape": "box", "center": [0.0, 0.0], "size": [20_000.0, 20_000.0]}
+
+
+def sensor_table(name: str = "a", **changes: Any) -> dict[str, Any]:
+    """A sensor as the scenario file has it."""
+    return {
+        "name": name,
+        "position": [3000.0, 0.0],
+        "sigma": [50.0, 50.0],
+        "p_d": 0.9,
+        "false_plots": 2.0,
+        "field_of_view": BOX,
+        "scan_interval": 2.0,
+        **changes,
+    }
+
+
+def hypothesis_table(x: float = 0.0, y: float = 0.0, **changes: Any) -> dict[str, Any]:
+    """A hypothesis as the scenario file has it, at (x, y)."""
+    return {"state": [x, y, 150.0, 0.0], "sigma": [100.0, 100.0, 20.0, 20.0], **changes}
+
+
+def scenario(*sensors: dict[str, Any], **tables: Any) -> Scenario:
+    """A scenario of the given sensors (default: a and b), one target that is drawn from the only hypothesis."""
+    return Scenario.model_validate(
+        {
+            "name": "test",
+            "motion": {"psd": 10.0},
+            "sensor": sensors or (sensor_table("a"), sensor_table("b")),
+            "simulation": {"duration": 20.0},
+            "target": [{"hypothesis": 0}],
+            "hypothesis": [hypothesis_table()],
+            **tables,
+        }
+    )
+
+
+def same(first: Sequence[Any], second: Sequence[Any]) -> bool:
+    """Whether two messages of the same type are equal, arrays and their dtypes included."""
+    if type(first) is not type(second):
+        return False
+    for one, other in zip(first, second, strict=True):
+        if isinstance(one, np.ndarray):
+            if one.dtype != other.dtype or not np.array_equal(one, other):
+                return False
+        elif type(one) is not type(other) or one != other:
+            return False
+    return True
+
+
+def all_same(first: Sequence[Sequence[Any]], second: Sequence[Sequence[Any]]) -> bool:
+    """Whether two lists of messages are equal."""
+    return len(first) == len(second) and all(same(one, other) for one, other in zip(first, second, strict=True))
+
+
+def only(kind: type[Any], messages: Iterable[Message]) -> list[Any]:
+    """The messages of one type."""
+    return [message for message in messages if isinstance(message, kind)]
+
+
+class Stage:
+    """A center, its state, and everything it said."""
+
+    def __init__(self, plot: Scenario, **options: Any) -> None:
+        self.scenario = plot
+        self.center = Center.of(plot, **options)
+        self.state: CenterState = self.center.initial(0)
+        self.said: list[Message] = []
+
+    def tell(self, event: Event, at_s: float = 0.0) -> list[Message]:
+        """One event at a wall time; the answer."""
+        self.state, messages = self.center.step(self.state, event, round(at_s * NS_PER_S))
+        self.said += messages
+        return messages
+
+    def tick(self, at_s: float) -> list[Message]:
+        """Time has passed."""
+        return self.tell(Tick(), at_s)
+
+    def join(self, name: str, next_s: float | None, incarnation: int = 1, at_s: float = 0.0) -> list[Message]:
+        """A sensor joins; ``next_s`` None: it has nothing to report."""
+        return self.tell(Join(name, incarnation, self.ns(next_s)), at_s)
+
+    def join_all(self, next_s: float = 2.0) -> dict[str, Start]:
+        """All sensors join; the tracks each was given."""
+        starts = [start for name in self.scenario.sensor_names for start in only(Start, self.join(name, next_s))]
+        return {start.sensor: start for start in starts}
+
+    def ns(self, time_s: float | None) -> int:
+        """Scenario seconds in wire time."""
+        return NEVER if time_s is None else self.scenario.to_ns(time_s)
+
+    def report(self, name: str, time_s: float, next_s: float | None = -1.0, **changes: Any) -> Report:
+        """A report that fits: of one track, number 0, with the factor unchanged by whatever was seen.
+
+        Args:
+            name: of the sensor.
+            time_s: of its scan.
+            next_s: when it will see next; -1: 2 s later, None: never.
+            changes: fields to set.
+        """
+        number = self.scenario.sensor_names.index(name)
+        n = self.scenario.motion.build().n
+        report = Report(
+            sensor=name,
+            sequence=0,
+            time_ns=self.ns(time_s),
+            next_ns=self.ns(time_s + 2.0 if next_s == -1.0 else next_s),
+            epoch=self.state.members[number].epoch,
+            ids=np.array([0]),
+            terms=np.array([1]),
+            log_g=np.array([0.0]),
+            x=np.zeros((1, n)),
+            P=1e4 * np.eye(n)[None],
+        )
+        return report._replace(**changes)
+
+    @property
+    def clear_s(self) -> list[float | None]:
+        """How far the clock told the nodes to go, one after the other; None: everything is done."""
+        return [
+            None if clock.clear_ns == NEVER else self.scenario.to_seconds(clock.clear_ns)
+            for clock in only(Clock, self.said)
+        ]
+
+    @property
+    def decisions(self) -> list[Decision]:
+        """All decisions so far."""
+        return only(Decision, self.said)
+
+    @property
+    def tracks(self) -> Tracks:
+        """The picture of now."""
+        return self.center.tracks(self.state)
+
+
+class Node:
+    """A sensor's tracker and its state."""
+
+    def __init__(self, plot: Scenario, name: str, start: Start | None = None) -> None:
+        self.tracker = LocalTracker.of(plot, name)
+        self.state: NodeState = self.tracker.initial()
+        if start is not None:
+            self.start(start)
+
+    def start(self, start: Start) -> None:
+        """Take over tracks."""
+        self.state = self.tracker.start(self.state, start)
+
+    def scan(self, scan: Scan, next_ns: int = NEVER) -> Report:
+        """Filter a scan."""
+        self.state, report = self.tracker.scan(self.state, scan, next_ns)
+        return report
+
+
+def reports_of(plot: Scenario, starts: dict[str, Start], scans: Sequence[Scan]) -> list[Report]:
+    """What the nodes of a network report of the scans, by time."""
+    nodes = {name: Node(plot, name, start) for name, start in starts.items()}
+    reports = []
+    for at, scan in enumerate(scans):
+        later = [other.time_ns for other in scans[at + 1 :] if other.sensor == scan.sensor]
+        reports.append(nodes[scan.sensor].scan(scan, later[0] if later else NEVER))
+    return reports

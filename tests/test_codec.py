@@ -1,0 +1,472 @@
+from __future__ import annotations
+
+import tracemalloc
+from typing import Any, get_args
+
+import msgpack
+import numpy as np
+import pytest
+from builders import same
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from common.codec import LAYOUTS, VERSION, decode, encode
+from common.errors import DecodeError, VersionError
+from common.messages import (
+    NEVER,
+    Advice,
+    Clock,
+    Decision,
+    Join,
+    Keys,
+    Message,
+    Report,
+    Scan,
+    Start,
+    Stop,
+    Tracks,
+    sensor_of,
+)
+
+KEYS = Keys("coast")
+EPOCH_NS = 1_767_225_600_000_000_000
+FUZZ = settings(deadline=None, derandomize=True, max_examples=300, database=None)
+
+
+def covariances(rng: np.random.Generator, count: int, n: int) -> Any:
+    root = rng.standard_normal((count, n, n))
+    return root @ root.mT + np.eye(n)
+
+
+def ids(count: int) -> Any:
+    return np.arange(count) * 3 + 1
+
+
+def report(tracks: int, n: int = 4, terms: int = 1) -> Report:
+    rng = np.random.default_rng(tracks)
+    total = tracks * terms
+    return Report(
+        sensor="radar-1",
+        sequence=7,
+        time_ns=EPOCH_NS,
+        next_ns=EPOCH_NS + 2_000_000_000,
+        epoch=3,
+        ids=ids(tracks),
+        terms=np.full(tracks, terms),
+        log_g=rng.standard_normal(total),
+        x=rng.standard_normal((total, n)),
+        P=covariances(rng, total, n),
+    )
+
+
+def start(tracks: int, n: int = 4) -> Start:
+    rng = np.random.default_rng(tracks)
+    return Start(
+        sensor="radar-1",
+        epoch=3,
+        ids=ids(tracks),
+        times_ns=EPOCH_NS + np.arange(tracks),
+        log_p_bar=rng.standard_normal(tracks),
+        x=rng.standard_normal((tracks, n)),
+        P=covariances(rng, tracks, n),
+        x_a=rng.standard_normal((tracks, n)),
+        P_a=covariances(rng, tracks, n),
+    )
+
+
+def advice(tracks: int, n: int = 4) -> Advice:
+    rng = np.random.default_rng(tracks)
+    return Advice(EPOCH_NS, ids(tracks), rng.standard_normal((tracks, n)), covariances(rng, tracks, n))
+
+
+def picture(tracks: int, n: int = 4, sensors: int = 3) -> Tracks:
+    rng = np.random.default_rng(tracks)
+    return Tracks(
+        time_ns=EPOCH_NS,
+        sensors=tuple(f"radar-{number}" for number in range(sensors)),
+        ids=ids(tracks),
+        status=rng.integers(0, 3, tracks).astype(np.uint8),
+        scans=rng.integers(0, 100, tracks),
+        contributing=rng.random((tracks, sensors)) < 0.5,
+        log_lr=rng.standard_normal(tracks),
+        log_lr_total=rng.standard_normal(tracks),
+        x=rng.standard_normal((tracks, n)),
+        P=covariances(rng, tracks, n),
+    )
+
+
+def scan(plots: int, d: int = 2) -> Scan:
+    rng = np.random.default_rng(plots)
+    return Scan("radar-1", EPOCH_NS, rng.standard_normal(d), rng.standard_normal((plots, d)))
+
+
+MESSAGES: dict[str, Message] = {
+    **{f"report-{t}": report(t) for t in (0, 1, 100)},
+    "report-3d": report(2, n=6),
+    "report-terms": report(5, terms=3),
+    "report-mixed-terms": report(1, terms=6)._replace(ids=ids(3), terms=np.array([1, 2, 3])),
+    "report-impossible": report(2)._replace(log_g=np.array([-np.inf, -1.0])),
+    "report-last": report(1)._replace(next_ns=NEVER),
+    **{f"scan-{m}": scan(m) for m in (0, 1, 100)},
+    "scan-3d": scan(2, d=3),
+    "join": Join("radar-1", 2**63 - 1, EPOCH_NS),
+    "join-never": Join("radar-1", 0, NEVER),
+    **{f"start-{t}": start(t) for t in (0, 1, 100)},
+    "start-3d": start(2, n=6),
+    "start-impossible": start(1)._replace(log_p_bar=np.array([-np.inf])),
+    **{f"stop-{t}": Stop("radar-1", ids(t)) for t in (0, 1, 100)},
+    **{f"advice-{t}": advice(t) for t in (0, 1, 100)},
+    "clock": Clock(EPOCH_NS, EPOCH_NS + 1, 10.0, EPOCH_NS),
+    "clock-never": Clock(-1, 0, 0.0, NEVER),
+    **{f"tracks-{t}": picture(t) for t in (0, 1, 100)},
+    "tracks-impossible": picture(1)._replace(log_lr=np.array([-np.inf]), log_lr_total=np.array([-np.inf])),
+    "tracks-one-sensor": picture(2, sensors=1),
+    "decision-confirmed": Decision("confirmed", 4, EPOCH_NS, 9.5, 11.0, 12),
+    "decision-deleted": Decision("deleted", 4, EPOCH_NS, -np.inf, -np.inf, 1),
+    "decision-withdrawn": Decision("withdrawn", 4, EPOCH_NS, -3.5, -3.5, 2),
+}
+each_message = pytest.mark.parametrize("message", MESSAGES.values(), ids=MESSAGES.keys())
+
+
+def refusal(payload: bytes, key: str | None = None) -> str:
+    """Why a payload is refused."""
+    with pytest.raises(DecodeError) as caught:
+        decode(KEYS.report("radar-1") if key is None else key, payload)
+    return str(caught.value)
+
+
+def altered(message: Message, **changes: Any) -> bytes:
+    """A message whose envelope was tampered with."""
+    parts = dict(zip(("version", "kind", "scalars", "sizes", "blocks"), msgpack.unpackb(encode(message)), strict=True))
+    return msgpack.packb(list({**parts, **changes}.values()))
+
+
+@each_message
+def test_a_message_comes_back_as_it_was_sent(message: Message) -> None:
+    assert same(decode(KEYS.of(message), encode(message)), message)
+
+
+@each_message
+def test_a_message_takes_the_same_bytes_again(message: Message) -> None:
+    payload = encode(message)
+    assert encode(decode(KEYS.of(message), payload)) == payload
+
+
+def test_every_type_of_message_has_a_layout_and_is_tested() -> None:
+    types = set(get_args(Message))
+    assert {message for message, _ in LAYOUTS.values()} == types
+    assert {type(message) for message in MESSAGES.values()} == types
+
+
+def test_arrays_that_come_back_can_be_written_to() -> None:
+    decoded = decode(KEYS.report("radar-1"), encode(report(1)))
+    assert isinstance(decoded, Report)
+    assert all(array.flags.writeable for array in (decoded.ids, decoded.terms, decoded.log_g, decoded.x, decoded.P))
+
+
+def test_arrays_may_be_laid_out_in_any_way() -> None:
+    message = report(4)
+    turned = message._replace(x=np.asfortranarray(message.x), P=message.P.mT, log_g=np.repeat(message.log_g, 2)[::2])
+    assert encode(turned) == encode(message)
+
+
+def test_the_name_of_the_sensor_is_the_keys() -> None:
+    decoded = decode(KEYS.report("radar-2"), encode(report(1)))
+    assert isinstance(decoded, Report)
+    assert decoded.sensor == "radar-2"
+
+
+GOLDEN_REPORT = Report(
+    sensor="a",
+    sequence=3,
+    time_ns=10,
+    next_ns=NEVER,
+    epoch=2,
+    ids=np.array([7]),
+    terms=np.array([1]),
+    log_g=np.array([-0.5]),
+    x=np.array([[1.0, 2.0]]),
+    P=np.array([[[4.0, 1.0], [1.0, 3.0]]]),
+)
+GOLDEN_START = Start(
+    sensor="a",
+    epoch=2,
+    ids=np.array([7]),
+    times_ns=np.array([258]),
+    log_p_bar=np.array([-0.5]),
+    x=np.array([[1.0, 2.0]]),
+    P=np.array([[[4.0, 1.0], [1.0, 3.0]]]),
+    x_a=np.array([[3.0, 4.0]]),
+    P_a=np.array([[[2.0, 0.0], [0.0, 2.0]]]),
+)
+GOLDEN = [
+    (
+        GOLDEN_REPORT,
+        "95 01 01"  # version, kind
+        "94 03 0a cf7fffffffffffffff 02"  # sequence, time, next, epoch
+        "93 01 01 02"  # T, N, n
+        "c4 35 07000000 01"  # bin; ids, terms
+        "000000000000e0bf"  # log_g
+        "000000000000f03f 0000000000000040"  # x
+        "0000000000001040 000000000000f03f 0000000000000840",  # upper triangle of P
+    ),
+    (
+        GOLDEN_START,
+        "95 01 04 91 02 92 01 02"  # version, kind, epoch, T, n
+        "c4 64 07000000 0201000000000000"  # bin; ids, times
+        "000000000000e0bf"  # log_p_bar
+        "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840"  # x, P
+        "0000000000000840 0000000000001040 0000000000000040 0000000000000000 0000000000000040",  # x_a, P_a
+    ),
+]
+
+
+@pytest.mark.parametrize(("message", "golden"), GOLDEN, ids=["report", "start"])
+def test_the_bytes_of_version_1_never_change(message: Message, golden: str) -> None:
+    payload = bytes.fromhex(golden)
+    assert encode(message) == payload
+    assert same(decode(KEYS.of(message), payload), message)
+
+
+def test_a_report_of_100_tracks_takes_at_most_140_bytes_a_track() -> None:
+    assert len(encode(report(100))) <= 140 * 100
+
+
+@pytest.mark.parametrize("version", [0, VERSION + 1, 7, -1, 2**64 - 1])
+def test_another_version_is_refused_whatever_follows(version: int) -> None:
+    for payload in (msgpack.packb([version]), altered(report(1), version=version)):
+        with pytest.raises(VersionError) as caught:
+            decode(KEYS.report("radar-1"), payload)
+        assert str(caught.value) == (
+            f"waldnet/coast/sensor/radar-1/report: {len(payload)} bytes are no message: "
+            f"version {version}, this program reads {VERSION}"
+        )
+
+
+@pytest.mark.parametrize("message", [report(1), scan(1), MESSAGES["join"], start(1), Stop("radar-1", ids(1))])
+def test_a_message_about_a_sensor_needs_a_key_with_one(message: Message) -> None:
+    key = "waldnet/coast/center/tracks"
+    payload = encode(message)
+    assert refusal(payload, key) == (
+        f"{key}: {len(payload)} bytes are no message: a {type(message).__name__} does not belong on this key"
+    )
+
+
+def floats(message: Message) -> list[str]:
+    return [
+        name
+        for name, value in message._asdict().items()
+        if isinstance(value, float) or (isinstance(value, np.ndarray) and value.dtype == np.float64)
+    ]
+
+
+FLOATS = [
+    (message, name) for message in (report(1), scan(1), start(1), advice(1), picture(1)) for name in floats(message)
+]
+FLOAT_NAMES = [f"{type(message).__name__}.{name}" for message, name in FLOATS]
+
+
+@pytest.mark.parametrize(("message", "name"), FLOATS, ids=FLOAT_NAMES)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_arrays_with_nan_or_infinity_are_refused(message: Message, name: str, value: float) -> None:
+    bad = getattr(message, name).copy()
+    bad.flat[0] = value
+    payload = encode(message._replace(**{name: bad}))
+    assert f"{name} has 1 values that are not finite" in refusal(payload, KEYS.of(message))
+
+
+@pytest.mark.parametrize("name", ["x", "P"])
+def test_minus_infinity_is_only_for_logarithms(name: str) -> None:
+    bad = getattr(report(1), name).copy()
+    bad.flat[0] = -np.inf
+    assert "not finite" in refusal(encode(report(1)._replace(**{name: bad})))
+
+
+SCALARS = [
+    (message, name) for message in (MESSAGES["clock"], MESSAGES["decision-confirmed"]) for name in floats(message)
+]
+
+
+@pytest.mark.parametrize(("message", "name"), SCALARS, ids=[f"{type(m).__name__}.{name}" for m, name in SCALARS])
+def test_scalars_that_are_nan_are_refused(message: Message, name: str) -> None:
+    assert name in refusal(encode(message._replace(**{name: float("nan")})), KEYS.of(message))
+
+
+BLOCKS = msgpack.unpackb(encode(GOLDEN_REPORT))[4]
+ENVELOPES = [
+    ("nothing", b"", "not msgpack"),
+    ("no msgpack", b"\xc1", "not msgpack"),
+    ("more after it", encode(report(1)) + b"\x00", "not msgpack"),
+    ("no array", msgpack.packb({"version": 1}), "expected an array that starts with the version"),
+    ("empty array", msgpack.packb([]), "expected an array that starts with the version"),
+    ("version as text", msgpack.packb(["1"]), "expected an array that starts with the version"),
+    ("version as truth", msgpack.packb([True]), "expected an array that starts with the version"),
+    ("too short", msgpack.packb([1, 1]), "2 elements, expected 5: version, kind, scalars, sizes, blocks"),
+    ("too long", msgpack.packb([1, 1, [], [], b"", 0]), "6 elements, expected 5"),
+    ("kind unknown", altered(GOLDEN_REPORT, kind=99), "kind 99 is unknown"),
+    ("kind as truth", altered(GOLDEN_REPORT, kind=True), "kind True is unknown"),
+    ("scalars missing", altered(GOLDEN_REPORT, scalars=[1, 2]), "expected the 4 scalars of a Report"),
+    ("scalars no list", altered(GOLDEN_REPORT, scalars=4), "expected the 4 scalars of a Report"),
+    ("time as float", altered(GOLDEN_REPORT, scalars=[0, 1.0, 2, 1]), "time_ns is a float, expected int"),
+    ("epoch as truth", altered(GOLDEN_REPORT, scalars=[0, 1, 2, True]), "epoch is a bool, expected int"),
+    ("time too large", altered(GOLDEN_REPORT, scalars=[0, 2**63, 2, 1]), "time_ns is "),
+    ("sizes missing", altered(GOLDEN_REPORT, sizes=[1, 1]), "expected the sizes of the axes T, N, n"),
+    ("size negative", altered(GOLDEN_REPORT, sizes=[1, -1, 2]), "expected the sizes of the axes T, N, n"),
+    ("size as truth", altered(GOLDEN_REPORT, sizes=[True, 1, 2]), "expected the sizes of the axes T, N, n"),
+    ("sizes of a join", altered(MESSAGES["join"], sizes=[1]), "expected the sizes of the axes (none)"),
+    ("blocks as text", altered(GOLDEN_REPORT, blocks="x" * 53), "blocks are a str, expected bin"),
+    ("blocks too short", altered(GOLDEN_REPORT, blocks=BLOCKS[:-1]), "52 bytes of blocks, expected 53"),
+    ("blocks too long", altered(GOLDEN_REPORT, blocks=BLOCKS + b"\0"), "54 bytes of blocks, expected 53"),
+    ("size forged", altered(GOLDEN_REPORT, sizes=[2**32, 1, 2]), "larger than the 53 bytes of blocks can hold"),
+    ("state forged", altered(GOLDEN_REPORT, sizes=[1, 1, 65]), "larger than the 53 bytes of blocks can hold"),
+    ("ids descending", encode(report(2)._replace(ids=np.array([5, 4]))), "ids are not ascending"),
+    ("ids repeated", encode(report(2)._replace(ids=np.array([5, 5]))), "ids are not ascending"),
+    ("track without term", encode(report(2)._replace(terms=np.array([2, 0]))), "2 terms of tracks, 2 terms sent"),
+    ("terms missing", encode(report(2)._replace(terms=np.array([2, 1]))), "3 terms of tracks, 2 terms sent"),
+]
+
+
+@pytest.mark.parametrize(("payload", "reason"), [case[1:] for case in ENVELOPES], ids=[case[0] for case in ENVELOPES])
+def test_what_is_wrong_is_said(payload: bytes, reason: str) -> None:
+    text = refusal(payload)
+    assert text.startswith(f"waldnet/coast/sensor/radar-1/report: {len(payload)} bytes are no message: ")
+    assert reason in text
+
+
+def test_an_unknown_decision_is_refused() -> None:
+    scalars = ["perhaps", 4, EPOCH_NS, 1.0, 1.0, 1]
+    assert "decision 'perhaps' is unknown" in refusal(altered(MESSAGES["decision-deleted"], scalars=scalars), "k")
+
+
+def test_tracks_have_one_column_per_sensor() -> None:
+    refusal(encode(picture(2, sensors=3)._replace(sensors=("radar-1",))), KEYS.tracks())
+
+
+def test_an_unknown_status_is_refused() -> None:
+    refusal(encode(picture(1)._replace(status=np.array([3], np.uint8))), KEYS.tracks())
+
+
+def test_a_refusal_is_short_whatever_was_sent() -> None:
+    assert len(refusal(msgpack.packb([1, "x" * 100_000, [], [], b""]))) < 1000
+
+
+# Fuzzed bytes ---------------------------------------------------------------------------------------------------------
+
+
+def survives(key: str, payload: bytes) -> None:
+    """Bytes are a message or a DecodeError, take little memory, and a message encodes to bytes that decode to it."""
+    tracemalloc.start()
+    try:
+        message = decode(key, payload)
+    except DecodeError as error:
+        assert str(error).startswith(f"{key}: {len(payload)} bytes")
+    else:
+        assert same(decode(key, encode(message)), message)
+    finally:
+        _, peak = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert peak < 1_000_000 + 100 * len(payload)
+
+
+any_key = st.sampled_from([KEYS.of(message) for message in MESSAGES.values()] + ["", "waldnet/coast/center/picture"])
+any_message = st.sampled_from([message for name, message in MESSAGES.items() if not name.endswith("100")])
+any_int = st.integers(-(2**63), 2**64 - 1)
+scalar = st.none() | st.booleans() | any_int | st.floats() | st.text(max_size=8) | st.binary(max_size=64)
+structure = st.recursive(
+    scalar,
+    lambda inner: st.lists(inner, max_size=6) | st.dictionaries(st.text(max_size=3) | any_int, inner, max_size=3),
+    max_leaves=12,
+)
+size = st.integers(0, 70) | st.integers(0, 2**64 - 1)
+
+
+@FUZZ
+@given(any_key, st.binary(max_size=300))
+def test_random_bytes(key: str, payload: bytes) -> None:
+    survives(key, payload)
+
+
+@pytest.mark.parametrize("name", ["report-1", "scan-1", "join", "start-1", "stop-1", "advice-1", "clock", "tracks-1"])
+def test_truncated_bytes(name: str) -> None:
+    message = MESSAGES[name]
+    payload = encode(message)
+    for length in range(len(payload)):
+        refusal(payload[:length], KEYS.of(message))
+
+
+@FUZZ
+@given(any_message, st.lists(st.integers(0, 2**20), min_size=1, max_size=3))
+def test_flipped_bits(message: Message, bits: list[int]) -> None:
+    payload = bytearray(encode(message))
+    for bit in bits:
+        at = bit % (8 * len(payload))
+        payload[at // 8] ^= 1 << at % 8
+    survives(KEYS.of(message), bytes(payload))
+
+
+@FUZZ
+@given(any_key, structure)
+def test_random_structures(key: str, content: Any) -> None:
+    survives(key, msgpack.packb(content))
+
+
+@FUZZ
+@given(any_key, st.integers(0, 10), structure, structure, structure)
+def test_random_bodies(key: str, kind: int, scalars: Any, sizes: Any, blocks: Any) -> None:
+    survives(key, msgpack.packb([VERSION, kind, scalars, sizes, blocks]))
+
+
+@FUZZ
+@given(any_message, st.lists(size, max_size=5), st.none() | st.binary(max_size=200))
+def test_forged_sizes(message: Message, sizes: list[int], blocks: bytes | None) -> None:
+    changes = {} if blocks is None else {"blocks": blocks}
+    survives(KEYS.of(message), altered(message, sizes=sizes, **changes))
+
+
+@pytest.mark.parametrize("header", [b"\x91", b"\x81\xa1a", b"\x92\x01"])
+def test_deep_nesting(header: bytes) -> None:
+    survives("k", header * 100_000)
+
+
+@pytest.mark.parametrize(
+    "header", [b"\xdd\xff\xff\xff\xff", b"\xdf\xff\xff\xff\xff", b"\xc6\xff\xff\xff\xff", b"\xc9\xff\xff\xff\xff"]
+)
+def test_forged_lengths_of_msgpack(header: bytes) -> None:
+    survives("k", header)
+    survives("k", b"\x92\x01" + header)
+
+
+# Keys -----------------------------------------------------------------------------------------------------------------
+
+
+def test_every_message_has_its_key() -> None:
+    keys = {type(message).__name__: KEYS.of(message) for message in MESSAGES.values()}
+    assert keys == {
+        "Report": "waldnet/coast/sensor/radar-1/report",
+        "Scan": "waldnet/coast/sensor/radar-1/plots",
+        "Join": "waldnet/coast/sensor/radar-1/join",
+        "Start": "waldnet/coast/center/command/radar-1",
+        "Stop": "waldnet/coast/center/command/radar-1",
+        "Advice": "waldnet/coast/center/advice",
+        "Clock": "waldnet/coast/center/clock",
+        "Tracks": "waldnet/coast/center/tracks",
+        "Decision": "waldnet/coast/center/decision",
+    }
+
+
+@pytest.mark.parametrize(
+    ("key", "sensor"),
+    [
+        (KEYS.report("radar-1"), "radar-1"),
+        (KEYS.about("radar-1"), "radar-1"),
+        (KEYS.command("radar-1"), "radar-1"),
+        (KEYS.sensor_alive("radar-1"), "radar-1"),
+        (KEYS.center_alive(), ""),
+        (KEYS.clock(), ""),
+        (KEYS.picture(), ""),
+        ("other/coast/sensor/radar-1/report", ""),
+        ("", ""),
+    ],
+)
+def test_the_sensor_of_a_key(key: str, sensor: str) -> None:
+    assert sensor_of(key) == sensor

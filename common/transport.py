@@ -15,7 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, NamedTuple, Protocol, Self
 
 import zenoh
 from zenoh import ext
@@ -23,9 +23,6 @@ from zenoh.handlers import FifoChannel
 
 from common.config import Network
 from common.errors import TransportError
-
-T = TypeVar("T")
-T_co = TypeVar("T_co", covariant=True)
 
 # Both are called on a transport thread and must only enqueue.
 Deliver = Callable[[str, bytes], None]  # key, payload
@@ -69,7 +66,7 @@ class Bus(Protocol):
 
         Args:
             key: what to publish on.
-            cache: samples kept for recovery and for late subscribers; only if reliable.
+            cache: samples kept for recovery and for late subscribers, if reliable.
             reliable: whether losses are noticed and repaired; display data needs neither, its next sample will do.
         """
 
@@ -163,12 +160,13 @@ def _open_session(network: Network) -> zenoh.Session:
         try:
             return zenoh.open(config)
         except zenoh.ZError as error:
-            waited_s = time.monotonic() - started
-            nothing_answers = "Unable to connect" in str(error)
+            if not re.search("Unable to connect|timeout", str(error)):
+                raise TransportError(_cannot_open(network, _reason(error))) from error
             # Zenoh's own connect timeout would spend itself on the first of several endpoints.
-            if not nothing_answers or waited_s >= CONNECT_TIMEOUT_S:
-                why = _nothing_answers(network, waited_s) if nothing_answers else _cannot_open(network, _reason(error))
-                raise TransportError(why) from error
+            if (waited_s := time.monotonic() - started) >= CONNECT_TIMEOUT_S:
+                where = " or ".join(network.connect) or "any scouted address"
+                hint = "is the router or center running?"
+                raise TransportError(f"nothing answers at {where} within {waited_s:.1f} s; {hint}") from error
             time.sleep(_RETRY_MS / 1e3)
 
 
@@ -194,11 +192,6 @@ def _listening(session: zenoh.Session, network: Network) -> tuple[str, ...]:
     return tuple(state["locators"])
 
 
-def _nothing_answers(network: Network, waited_s: float) -> str:
-    where = " or ".join(network.connect) or "any scouted address"
-    return f"nothing answers at {where} within {waited_s:.1f} s; is the router or center running?"
-
-
 def _cannot_open(network: Network, reason: str) -> str:
     where = ", ".join([endpoint for endpoint in network.listen if endpoint in reason] or network.listen)
     if system_error := re.search(r"([A-Z][^:\[\]]*) \(os error \d+\)", reason):
@@ -221,11 +214,6 @@ def _explained(doing: str) -> Iterator[None]:
         raise TransportError(f"cannot {doing}: {_reason(error)}") from error
 
 
-class _Declared(Protocol[T_co]):
-    def __iter__(self) -> Iterator[T_co]: ...
-    def undeclare(self) -> None: ...
-
-
 class _ZenohPublisher(NamedTuple):
     key: str
     plain: zenoh.Publisher
@@ -245,7 +233,9 @@ class _ZenohBus(Bus):
     def __init__(self, session: zenoh.Session, endpoints: tuple[str, ...]) -> None:
         self._session = session
         self._endpoints = endpoints
-        # Zenoh drops what nobody refers to, and its close() leaves advanced subscribers: the stack keeps and ends all.
+        # Zenoh withdraws what nobody refers to. Its close() ends publishers, even amid a put() where undeclare() fails,
+        # but not advanced subscribers: the stack undeclares all else.
+        self._publishers: list[Publisher] = []
         self._closing = ExitStack()
         self._closing.callback(session.close)
         # A process that ends by an error must not leave Zenoh's threads calling into a dying interpreter.
@@ -255,20 +245,19 @@ class _ZenohBus(Bus):
     def publisher(self, key: str, *, cache: int = 50, reliable: bool = True) -> Publisher:
         with _explained(f"publish on {key}"):
             plain = self._session.declare_publisher(key, congestion_control=_DROP)
-            self._closing.callback(plain.undeclare)
-            if not reliable:
-                return _ZenohPublisher(key, plain, sender=plain)
-            # An advanced publisher cannot tell whether anyone listens: the plain one beside it does.
-            sender = ext.declare_advanced_publisher(
-                self._session,
-                key,
-                congestion_control=_DROP,
-                cache=ext.CacheConfig(max_samples=cache),
-                sample_miss_detection=_HEARTBEAT,
-                publisher_detection=True,
-            )
-            self._closing.callback(sender.undeclare)
-            return _ZenohPublisher(key, plain, sender)
+            sender: zenoh.Publisher | ext.AdvancedPublisher = plain
+            if reliable:
+                # An advanced publisher cannot tell whether anyone listens: the plain one beside it does.
+                sender = ext.declare_advanced_publisher(
+                    self._session,
+                    key,
+                    congestion_control=_DROP,
+                    cache=ext.CacheConfig(max_samples=cache),
+                    sample_miss_detection=_HEARTBEAT,
+                    publisher_detection=True,
+                )
+        self._publishers.append(publisher := _ZenohPublisher(key, plain, sender))
+        return publisher
 
     def subscribe(
         self,
@@ -309,14 +298,8 @@ class _ZenohBus(Bus):
             self._closing.callback(self._session.liveliness().declare_token(key).undeclare)
 
     def watch(self, key_expr: str, deliver: DeliverPresence) -> None:
-        present: set[str] = set()
-
         def on_token(sample: zenoh.Sample) -> None:
-            key, alive = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
-            # A second watch with history repeats the known tokens to the first (zenoh issue 2071).
-            if alive != (key in present):
-                present.symmetric_difference_update({key})
-                deliver(key, alive)
+            deliver(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         with _explained(f"watch {key_expr}"):
             liveliness = self._session.liveliness()
@@ -331,9 +314,9 @@ class _ZenohBus(Bus):
             self._serve(self._session.declare_queryable(key, FifoChannel(_CHANNEL_SIZE)), on_query)
 
     def ask(self, key_expr: str, timeout_s: float) -> list[tuple[str, bytes]]:
-        everyone, unmerged = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
+        every_one = zenoh.ConsolidationMode.NONE
         with _explained(f"ask {key_expr}"):
-            replies = self._session.get(key_expr, target=everyone, consolidation=unmerged, timeout=timeout_s)
+            replies = self._session.get(key_expr, consolidation=every_one, timeout=timeout_s)
             return [(str(r.ok.key_expr), r.ok.payload.to_bytes()) for r in replies if r.ok is not None]
 
     def endpoints(self) -> tuple[str, ...]:
@@ -342,7 +325,7 @@ class _ZenohBus(Bus):
     def close(self) -> None:
         self._closing.close()
 
-    def _serve(self, declared: _Declared[T], act: Callable[[T], None]) -> None:
+    def _serve(self, declared: Any, act: Callable[[Any], None]) -> None:
         """Drain a declaration's channel on a thread of its own until it is undeclared."""
         items = iter(declared)
 

@@ -200,14 +200,13 @@ class Fuser:
     def _predict(self, picture: Picture, t_ns: int) -> tuple[Gaussian, Array]:
         """Predict all factors as their nodes do (Eq. 5; ``dkf``: with one covariance for all)."""
         dt: Array = (t_ns - picture.times_ns) / NS_PER_S
-        if len(dt) and (dt == dt[0]).all():
-            dt = dt[:1]
+        dt = dt[0, ...] if len(dt) and (dt == dt[0]).all() else dt[:, None]
         factors = Gaussian(picture.x, picture.P)
         if not self.globalised:
-            return self.share.predict(factors, self.motion, dt[:, None]), picture.network_P
+            return self.share.predict(factors, self.motion, dt), picture.network_P
         common = globalise(picture.network_P)
         P = np.repeat(common.P[:, None], len(self.sensors), axis=1)
-        predicted = self.share.predict(Gaussian(np.matvec(common.G, factors.x), P), self.motion, dt[:, None])
+        predicted = self.share.predict(Gaussian(np.matvec(common.G, factors.x), P), self.motion, dt)
         return predicted, predicted.P
 
     def _shrunk(self, network_P: Array, reports: Mapping[int, Report]) -> Array:

@@ -266,9 +266,9 @@ class LocalTracker:
 
 
 def _interval(times_ns: IntArray, t_ns: int) -> Array:
-    """Seconds from ``times_ns`` to ``t_ns``, shape (T,); (1,) when all are equal, which saves T - 1 matrices."""
+    """Seconds from ``times_ns`` to ``t_ns``, shape (T,); () when all are equal, which makes F one matrix for all."""
     dt: Array = (t_ns - times_ns) / NS_PER_S
-    return dt[:1] if len(dt) and (dt == dt[0]).all() else dt
+    return dt[0, ...] if len(dt) and (dt == dt[0]).all() else dt
 
 
 def _plots(scan: Scan) -> Plots:

@@ -9,7 +9,7 @@ from common.codec import decode
 from common.config import Scenario
 from common.inbox import Heard, Inbox
 from common.messages import Keys, Scan
-from common.transport import MemoryNetwork
+from common.transport import Bus, MemoryNetwork
 from fusion_center.center import Center
 from fusion_center.shell import CenterShell
 from sensor_node.shell import NodeShell
@@ -32,9 +32,10 @@ def run_in_memory(scenario: Scenario, scans: Sequence[Scan], *, speed: float = 0
     memory, heard = MemoryNetwork(), Inbox()
     keys = Keys(scenario.network.name)
     schedule = schedule_of(scans, scenario)
-    with memory.bus() as listener, memory.bus() as center_bus:
+    with memory.bus() as listener:
         for key in (keys.tracks(), keys.decision(), keys.plots()):
             listener.subscribe(key, heard.heard)
+        center_bus = memory.bus()
         buses = {name: memory.bus() for name in scenario.sensor_names}
         center = CenterShell(center_bus, scenario.network, scenario, Center.of(scenario, speed=speed))
         nodes = [
@@ -48,14 +49,14 @@ def run_in_memory(scenario: Scenario, scans: Sequence[Scan], *, speed: float = 0
         ]
         shells: list[CenterShell | NodeShell] = [center, *nodes]
         with ThreadPoolExecutor(len(shells)) as pool:
-            running = [pool.submit(shell.run) for shell in shells]
+            running = [
+                pool.submit(_run, shell, bus) for shell, bus in zip(shells, [center_bus, *buses.values()], strict=True)
+            ]
             done, _ = wait(running, return_when=FIRST_EXCEPTION)
             for shell in shells:
                 shell.stop()
             for future in done:
                 future.result()
-        for bus in buses.values():
-            bus.close()
     record = Record(scenario)
     while not heard.empty:
         match heard.receive(None):
@@ -64,3 +65,8 @@ def run_in_memory(scenario: Scenario, scans: Sequence[Scan], *, speed: float = 0
             case _:
                 pass
     return record
+
+
+def _run(shell: CenterShell | NodeShell, bus: Bus) -> None:
+    with bus:
+        shell.run()

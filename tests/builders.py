@@ -11,7 +11,8 @@ from common.config import NS_PER_S, Scenario
 from common.messages import NEVER, Clock, Decision, Join, Message, Report, Scan, Start, Tracks
 from fusion_center.center import Center, Event, Tick
 from fusion_center.center import State as CenterState
-from sensor_node.tracker import LocalTracker
+from sensor_node.sources import schedule_of
+from sensor_node.tracker import LocalTracker, Schedule
 from sensor_node.tracker import State as NodeState
 
 BOX = {"shape": "box", "center": [0.0, 0.0], "size": [20_000.0, 20_000.0]}
@@ -97,22 +98,23 @@ class Stage:
         """A sensor joins; ``next_s`` None: it has nothing to report."""
         return self.tell(Join(name, incarnation, self.ns(next_s)), at_s)
 
-    def join_all(self, next_s: float = 2.0) -> dict[str, Start]:
-        """All sensors join; the tracks each was given."""
-        starts = [start for name in self.scenario.sensor_names for start in only(Start, self.join(name, next_s))]
+    def join_all(self, **next_s: float) -> dict[str, Start]:
+        """All sensors join, the next scan of each at 2 s unless given; the tracks each was told of."""
+        names = self.scenario.sensor_names
+        starts = [start for name in names for start in only(Start, self.join(name, next_s.get(name, 2.0)))]
         return {start.sensor: start for start in starts}
 
     def ns(self, time_s: float | None) -> int:
         """Scenario seconds in wire time."""
         return NEVER if time_s is None else self.scenario.to_ns(time_s)
 
-    def report(self, name: str, time_s: float, next_s: float | None = -1.0, **changes: Any) -> Report:
-        """A report that fits: of one track, number 0, with the factor unchanged by whatever was seen.
+    def report(self, name: str, time_s: float, next_s: float | None = None, **changes: Any) -> Report:
+        """A report that fits: of track 0, at the origin, with no evidence.
 
         Args:
             name: of the sensor.
             time_s: of its scan.
-            next_s: when it will see next; -1: 2 s later, None: never.
+            next_s: when it will see next; None: 2 s later.
             changes: fields to set.
         """
         number = self.scenario.sensor_names.index(name)
@@ -121,7 +123,7 @@ class Stage:
             sensor=name,
             sequence=0,
             time_ns=self.ns(time_s),
-            next_ns=self.ns(time_s + 2.0 if next_s == -1.0 else next_s),
+            next_ns=self.ns(time_s + 2.0 if next_s is None else next_s),
             epoch=self.state.members[number].epoch,
             ids=np.array([0]),
             terms=np.array([1]),
@@ -153,8 +155,8 @@ class Stage:
 class Node:
     """A sensor's tracker and its state."""
 
-    def __init__(self, plot: Scenario, name: str, start: Start | None = None) -> None:
-        self.tracker = LocalTracker.of(plot, name)
+    def __init__(self, plot: Scenario, name: str, start: Start | None = None, schedule: Schedule | None = None) -> None:
+        self.tracker = LocalTracker.of(plot, name, schedule)
         self.state: NodeState = self.tracker.initial()
         if start is not None:
             self.start(start)
@@ -171,7 +173,8 @@ class Node:
 
 def reports_of(plot: Scenario, starts: dict[str, Start], scans: Sequence[Scan]) -> list[Report]:
     """What the nodes of a network report of the scans, by time."""
-    nodes = {name: Node(plot, name, start) for name, start in starts.items()}
+    schedule = schedule_of(scans, plot)
+    nodes = {name: Node(plot, name, start, schedule) for name, start in starts.items()}
     reports = []
     for at, scan in enumerate(scans):
         later = [other.time_ns for other in scans[at + 1 :] if other.sensor == scan.sensor]

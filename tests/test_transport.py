@@ -49,17 +49,17 @@ def await_presence(bus: Bus, *keys: str) -> None:
     assert sorted(inbox.take(len(keys))) == sorted((key, True) for key in keys)
 
 
-def publish_early(join: Join, sensor: Bus, key: str, payloads: list[bytes], **kind: Any) -> Publisher:
-    """Publish, and return when nothing of it is under way any more: a third has it."""
-    witness, inbox = join(), Inbox()
-    witness.subscribe(key, inbox)
-    witness.announce("witness")
-    await_presence(sensor, "witness")
+def publish_early(sensor: Bus, center: Bus, key: str, count: int, **kind: Any) -> Publisher:
+    """Publish, and return when nothing of it is under way any more: what was sent after it has arrived."""
+    inbox = Inbox()
+    center.subscribe("fence", inbox)
+    center.announce("fence")
+    await_presence(sensor, "fence")
     publisher = sensor.publisher(key, **kind)
-    for payload in payloads:
-        publisher.put(payload)
-    assert inbox.take(len(payloads)) == [(key, payload) for payload in payloads]
-    witness.close()
+    for n in range(count):
+        publisher.put(b"%d" % n)
+    sensor.publisher("fence").put(b"")
+    inbox.take(1)
     return publisher
 
 
@@ -163,7 +163,7 @@ def test_key_expressions_match_whole_chunks(join: Join, key_expr: str, heard: li
 @pytest.mark.parametrize(("cache", "history", "expected"), [(50, 3, [7, 8, 9]), (2, 50, [8, 9]), (50, 50, range(10))])
 def test_a_late_subscriber_gets_the_cached_samples(join: Join, cache: int, history: int, expected: list[int]) -> None:
     center, sensor = join(), join()
-    publisher = publish_early(join, sensor, "net/report", [b"%d" % n for n in range(10)], cache=cache)
+    publisher = publish_early(sensor, center, "net/report", 10, cache=cache)
     inbox = Inbox()
     center.subscribe("net/*", inbox, history=history)
     assert inbox.take(len(expected)) == [("net/report", b"%d" % n) for n in expected]
@@ -173,7 +173,7 @@ def test_a_late_subscriber_gets_the_cached_samples(join: Join, cache: int, histo
 
 def test_without_history_a_late_subscriber_gets_only_what_follows(join: Join) -> None:
     center, sensor = join(), join()
-    publisher = publish_early(join, sensor, "net/report", [b"early"])
+    publisher = publish_early(sensor, center, "net/report", 1)
     inbox = Inbox()
     center.subscribe("net/*", inbox)
     center.announce("net/center")
@@ -193,11 +193,11 @@ def test_history_also_comes_from_a_publisher_that_joins_later(join: Join) -> Non
 
 def test_a_display_publisher_keeps_no_history(join: Join) -> None:
     center, sensor = join(), join()
-    publish_early(join, sensor, "net/display", [b"early"], reliable=False)
-    publish_early(join, sensor, "net/report", [b"early"])
+    publish_early(sensor, center, "net/display", 1, reliable=False)
+    publish_early(sensor, center, "net/report", 1)
     inbox = Inbox()
     center.subscribe("net/*", inbox, history=50)
-    assert inbox.take(1) == [("net/report", b"early")]
+    assert inbox.take(1) == [("net/report", b"0")]
 
 
 def test_a_bus_hears_itself(join: Join) -> None:
@@ -265,6 +265,9 @@ def test_a_token_of_two_lives_until_the_second_is_gone(join: Join) -> None:
     two.announce("net/twin")
     two.announce("net/two")
     assert sorted(inbox.take(2)) == [("net/twin", True), ("net/two", True)]
+    late = Inbox()
+    center.watch("net/*", late)
+    assert sorted(late.take(2)) == [("net/twin", True), ("net/two", True)]
     one.announce("net/one")
     one.close()
     assert inbox.take(2) == [("net/one", True), ("net/one", False)]
@@ -346,17 +349,26 @@ def test_a_closed_bus_says_so(join: Join, use: Callable[[Bus, str], None]) -> No
 
 def test_closing_delivers_what_has_arrived(join: Join) -> None:
     center, sensor = join(), join()
-    inbox, arrived = Inbox(), threading.Event()
-    center.subscribe("net/a", inbox)
+    inbox, arrived, go_on = Inbox(), threading.Event(), threading.Event()
+
+    def deliver(key: str, payload: bytes) -> None:
+        assert go_on.wait(PATIENCE_S)
+        inbox(key, payload)
+
+    center.subscribe("net/a", deliver)
     center.subscribe("net/end", lambda *_: arrived.set())
     center.announce("net/center")
     await_presence(sensor, "net/center")
-    for n in range(1000):
-        sensor.publisher("net/a", reliable=False).put(b"%d" % n)
+    release = threading.Timer(0.1, go_on.set)
+    release.start()
+    publisher = sensor.publisher("net/a")
+    for n in range(100):
+        publisher.put(b"%d" % n)
     sensor.publisher("net/end").put(b"")
     assert arrived.wait(PATIENCE_S)
     center.close()
-    assert [payload for _, payload in inbox.rest()] == [b"%d" % n for n in range(1000)]
+    assert [payload for _, payload in inbox.rest()] == [b"%d" % n for n in range(100)]
+    release.join()
 
 
 def lose_samples(join: Join, cache: int, inbox: Inbox, misses: Inbox) -> None:
@@ -443,26 +455,27 @@ def test_one_sensor_serves_two_listening_peers_without_duplicates() -> None:
             assert inbox.rest() == []
 
 
-def test_a_peer_that_opens_first_finds_the_center_later() -> None:
-    endpoint, inbox = free_endpoint(), Inbox()
+def test_a_peer_that_opens_first_finds_the_center_whenever_it_comes() -> None:
+    endpoint, presence = free_endpoint(), Inbox()
     with open_zenoh(Network(connect=(endpoint,))) as sensor:
-        sensor.watch("net/*", inbox)
-        sensor.publisher("net/report").put(b"early")
-        with open_zenoh(Network(listen=(endpoint,))) as center:
-            center.subscribe("net/report", inbox, history=1)
-            center.announce("net/center")
-            assert sorted(inbox.take(2), key=str) == [("net/center", True), ("net/report", b"early")]
-        assert inbox.take(1) == [("net/center", False)]
-        with open_zenoh(Network(listen=(endpoint,))) as center:
-            center.announce("net/center")
-            assert inbox.take(1) == [("net/center", True)]
+        sensor.watch("net/*", presence)
+        publisher = sensor.publisher("net/report")
+        for n in range(6):
+            publisher.put(b"%d" % n)
+        for _ in range(2):
+            with open_zenoh(Network(listen=(endpoint,))) as center:
+                reports = Inbox()
+                center.subscribe("net/report", reports, history=4)
+                center.announce("net/center")
+                assert presence.take(1) == [("net/center", True)]
+                assert reports.take(4) == [("net/report", b"%d" % n) for n in (2, 3, 4, 5)]
+            assert presence.take(1) == [("net/center", False)]
 
 
 def test_endpoints_are_the_actual_ones() -> None:
     fixed = free_endpoint()
     with open_zenoh(Network(listen=(ANY_PORT, fixed))) as bus:
-        any_port, same = sorted(bus.endpoints(), key=[*bus.endpoints()].index)
-        assert same == fixed
+        (any_port,) = {*bus.endpoints()} - {fixed}
         assert int(any_port.removeprefix("tcp/127.0.0.1:")) > 0
         for endpoint in bus.endpoints():
             with open_zenoh(Network(mode="client", connect=(endpoint,))):
@@ -508,7 +521,7 @@ def test_a_malformed_endpoint_is_named(side: str, endpoint: str) -> None:
     )
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/[::1]:7447", "udp/radar-1.local:1#iface=lo", "tls/h:65535?prio=1"])
+@pytest.mark.parametrize("endpoint", ["tcp/[::1]:7447", "tcp/radar-1.local:1#iface=lo", "tls/h:65535?prio=1"])
 def test_well_formed_endpoints_pass(endpoint: str) -> None:
     with open_zenoh(Network(connect=(endpoint,))):
         pass
@@ -606,10 +619,9 @@ def start(program: str, *arguments: str) -> subprocess.Popen[str]:
     [
         ("bus.close()", 0, ""),
         ("", 0, ""),
-        ("raise SystemExit(3)", 3, ""),
         ("1 / 0", 1, "ZeroDivisionError: division by zero"),
     ],
-    ids=["closed", "forgotten", "exit", "error"],
+    ids=["closed", "forgotten", "error"],
 )
 def test_a_process_ends_even_if_it_forgets_to_close(end: str, code: int, last_words: str) -> None:
     with start(USE_EVERYTHING + end) as child:

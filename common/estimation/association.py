@@ -19,8 +19,9 @@ from common.estimation.gaussian import (
     Gaussian,
     cholesky,
     half_log_det,
-    log_sum_exp,
+    squared_norm,
     symmetric,
+    times_transposed,
     whiten,
 )
 from common.estimation.sensing import Linearised
@@ -91,11 +92,11 @@ def innovate(predicted: Gaussian, z: Array, sensor: Linearised) -> Innovations:
     Returns:
         the innovations.
     """
-    PH = predicted.P @ sensor.H.mT
-    L = cholesky(symmetric(sensor.H @ PH) + sensor.R)
+    PH = times_transposed(predicted.P, sensor.H)
+    L = cholesky(symmetric(times_transposed(PH.mT, sensor.H)) + sensor.R)
     L_plot = L[..., None, :, :]
     w = whiten(L_plot, z - sensor.z[..., None, :])
-    distance = np.vecdot(w, w)
+    distance = squared_norm(w)
     log_pdf = -0.5 * distance - half_log_det(L)[..., None] - 0.5 * LOG_2PI * L.shape[-1]
     return Innovations(w, whiten(L_plot, PH), distance, log_pdf)
 
@@ -124,8 +125,10 @@ def log_weights(innovations: Innovations, inside: BoolArray, clutter: Clutter) -
     """
     miss = _log(1.0 - clutter.p_d * clutter.p_g)
     plot = (_log(clutter.p_d) - clutter.log_rho_f)[..., None] + innovations.log_pdf
-    plot = np.where(inside, plot, -np.inf)
-    return np.concatenate([np.broadcast_to(miss, plot.shape[:-1])[..., None], plot], axis=-1)
+    weights = np.empty((*plot.shape[:-1], 1 + plot.shape[-1]))
+    weights[..., 0] = miss
+    weights[..., 1:] = np.where(inside, plot, -np.inf)
+    return weights
 
 
 def normalise(log_p_star: Array) -> tuple[Array, Array]:
@@ -135,11 +138,13 @@ def normalise(log_p_star: Array) -> tuple[Array, Array]:
         p_j, shape (..., 1 + M), and log p_bar, shape (...). A scan that h1 holds for impossible (p_d = 1 and no plot in
         the gate) gives log p_bar = -inf and, as nothing can be learnt from it, p_0 = 1.
     """
-    log_p_bar = log_sum_exp(log_p_star)
-    possible = np.isfinite(log_p_bar)[..., None]
-    p = np.exp(log_p_star - np.where(possible, log_p_bar[..., None], 0.0))
-    nothing = np.arange(p.shape[-1]) == 0
-    return np.where(possible, p, nothing), log_p_bar
+    top = log_p_star.max(axis=-1, keepdims=True)
+    possible = np.isfinite(top)
+    p = np.exp(log_p_star - np.where(possible, top, 0.0))
+    p[..., 0] += ~possible[..., 0]
+    total = p.sum(axis=-1, keepdims=True)
+    p /= total
+    return p, (top + np.log(total))[..., 0]
 
 
 def absorb(predicted: Gaussian, innovations: Innovations, p: Array) -> Gaussian:
@@ -158,7 +163,7 @@ def absorb(predicted: Gaussian, innovations: Innovations, p: Array) -> Gaussian:
     mean = weighted.sum(axis=-2)
     spread = weighted.mT @ w - mean[..., :, None] * mean[..., None, :]
     # P - (1-p_0) K S K' + K (spread) K' with both terms between the same gains.
-    shrink = hit.sum(axis=-1)[..., None, None] * np.eye(w.shape[-1]) - spread
+    shrink = (1.0 - p[..., 0])[..., None, None] * np.eye(w.shape[-1]) - spread
     return Gaussian(predicted.x + np.matvec(W, mean), symmetric(predicted.P - W @ shrink @ W.mT))
 
 

@@ -24,12 +24,15 @@ from common.estimation.gaussian import Array, BoolArray, Gaussian
 # Phi(-8.5) = 1e-17 vanishes beside 1.
 _CERTAIN = 8.5
 # Largest difference between a panel of the quadrature and its two halves; the halves are better by orders of magnitude.
-_TOLERANCE = 1e-8
-_BISECTIONS = 40
+_TOLERANCE = 1e-9
+_BISECTIONS = 30
 # Panels evaluated at once: bounds the memory whatever the batch.
 _CHUNK = 1024
 # Enough for a smooth edge within +-8.5 sigmas, so that most integrals need no bisection.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(28)
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
+# In radii. An edge is known to 16 digits, and a sigma must keep more of them than the tolerance asks for, or bisection
+# chases noise. The floor also mends the variance of a needle's narrow axis where rounding made it negative.
+_SIGMA_MIN = 1e-7
 # |rho| = 1 is no density; the next number below is one.
 _RHO_MAX = float(np.nextafter(1.0, 0.0))
 
@@ -112,7 +115,8 @@ class Everywhere(NamedTuple):
     def draw(self, rng: np.random.Generator, count: int, center: Array) -> Array:
         """Draw points uniformly in the square or cube around ``center``, shape (count, d)."""
         side = self.volume_ ** (1.0 / self.dimensions)
-        return center + side * rng.uniform(-0.5, 0.5, (count, self.dimensions))
+        points: Array = center + side * rng.uniform(-0.5, 0.5, (count, self.dimensions))
+        return points
 
 
 class Box(NamedTuple):
@@ -131,7 +135,7 @@ class Box(NamedTuple):
 
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included, shapes (..., d) to (...)."""
-        return np.all(np.abs(z - center) <= 0.5 * np.array(self.size), axis=-1)
+        return np.asarray(np.all(np.abs(z - center) <= 0.5 * np.array(self.size), axis=-1))
 
     def probability_inside(self, position: Gaussian, center: Array) -> Array:
         """Probability that Gaussian positions lie inside, shapes (..., d), (..., d, d) to (...)."""
@@ -171,14 +175,13 @@ class Disc(NamedTuple):
 
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included, shapes (..., d) to (...)."""
-        return np.linalg.vector_norm(z - center, axis=-1) <= self.radius
+        return np.asarray(np.linalg.vector_norm(z - center, axis=-1) <= self.radius)
 
     def probability_inside(self, position: Gaussian, center: Array) -> Array:
         """Probability that Gaussian positions lie inside, shapes (..., d), (..., d, d) to (...)."""
         mean, P = _relative(position, center)
         variances, axes = np.linalg.eigh(P)
-        # Rounding may turn the narrow axis of a very long ellipse negative.
-        sigma = np.sqrt(np.maximum(variances, 1e-16 * variances[..., -1:]))
+        sigma = np.sqrt(np.maximum(variances, (_SIGMA_MIN * self.radius) ** 2))
         radius = np.full(mean.shape[:-1], self.radius)
         return _ball(radius, np.vecmat(mean, axes), sigma)
 
@@ -243,7 +246,8 @@ def _rectangle(lower: Array, upper: Array, rho: Array) -> Array:
     rho = np.clip(rho, -_RHO_MAX, _RHO_MAX)
     root = np.sqrt((1.0 - rho) * (1.0 + rho))
     corner = owens_t(h, (k - rho * h) / (h * root)) + owens_t(k, (h - rho * k) / (k * root)) + 0.5 * (h * k < 0.0)
-    return corner[1] - corner[0] + corner[3] - corner[2]
+    probability: Array = corner[1] - corner[0] + corner[3] - corner[2]
+    return probability
 
 
 def _cuboid(lower: Array, upper: Array, correlation: Array) -> Array:
@@ -261,18 +265,18 @@ def _cuboid(lower: Array, upper: Array, correlation: Array) -> Array:
     certain = np.minimum(-lower, upper) >= _CERTAIN
     eye = np.eye(lower.shape[-1])
     correlation = np.where(certain[:, :, None] | certain[:, None, :], eye, correlation)
-    probability = _interval(lower, upper).prod(axis=-1)
+    probability: Array = _interval(lower, upper).prod(axis=-1)
     coupled = np.triu(correlation, 1).any(axis=(-2, -1))
     if coupled.any():
         lower, upper, correlation = lower[coupled], upper[coupled], correlation[coupled]
         plane = lower.shape[-1] == 2
         probability[coupled] = (
-            _rectangle(lower, upper, correlation[:, 0, 1]) if plane else _corner(lower, upper, correlation)
+            _rectangle(lower, upper, correlation[:, 0, 1]) if plane else _cuboid_corner(lower, upper, correlation)
         )
     return probability
 
 
-def _corner(lower: Array, upper: Array, correlation: Array) -> Array:
+def _cuboid_corner(lower: Array, upper: Array, correlation: Array) -> Array:
     """``_cuboid`` in 3-D where at least two axes are correlated, shapes (N, 3), (N, 3, 3) to (N,)."""
     # The integrand over one axis is as smooth as that axis given the other two, whose variance is det C / (1 - rho^2)
     # with rho of these two: so slice across the axis that has no part in the strongest correlation.
@@ -285,11 +289,11 @@ def _corner(lower: Array, upper: Array, correlation: Array) -> Array:
     probability = _interval(lower[:, 0], upper[:, 0]) * _rectangle(lower[:, 1:], upper[:, 1:], in_slice)
     coupled = to_slice.any(axis=-1)
     if coupled.any():
-        probability[coupled] = _slices(lower[coupled], upper[coupled], to_slice[coupled], in_slice[coupled])
+        probability[coupled] = _cuboid_by_slices(lower[coupled], upper[coupled], to_slice[coupled], in_slice[coupled])
     return probability
 
 
-def _slices(lower: Array, upper: Array, c: Array, rho: Array) -> Array:
+def _cuboid_by_slices(lower: Array, upper: Array, c: Array, rho: Array) -> Array:
     """Integrate the rectangles of a cuboid over its first axis.
 
     Args:
@@ -315,7 +319,7 @@ def _slices(lower: Array, upper: Array, c: Array, rho: Array) -> Array:
     ends = np.stack([lower[:, 1:] - _CERTAIN * s, upper[:, 1:] + _CERTAIN * s]) / slope
     start = np.maximum(ends.min(axis=0).max(axis=-1), np.maximum(lower[:, 0], -_CERTAIN))
     stop = np.minimum(ends.max(axis=0).min(axis=-1), np.minimum(upper[:, 0], _CERTAIN))
-    return _integrate(integrand, start, np.maximum(start, stop))
+    return _integrate(integrand, start, stop)
 
 
 def _ball(radius: Array, mean: Array, sigma: Array) -> Array:
@@ -336,10 +340,10 @@ def _ball(radius: Array, mean: Array, sigma: Array) -> Array:
         return _interval((-radius - mean[..., 0]) / sigma[..., 0], (radius - mean[..., 0]) / sigma[..., 0])
     margin = (radius - np.linalg.vector_norm(mean, axis=-1)) / sigma[..., -1]
     mean, sigma = (np.broadcast_to(a, (*radius.shape, a.shape[-1])) for a in (mean, sigma))
-    return _decide(margin, lambda near: _discs(radius[near], mean[near], sigma[near]))
+    return _decide(margin, lambda near: _ball_by_slices(radius[near], mean[near], sigma[near]))
 
 
-def _discs(radius: Array, mean: Array, sigma: Array) -> Array:
+def _ball_by_slices(radius: Array, mean: Array, sigma: Array) -> Array:
     """Integrate the slices of a ball over its first axis: shapes (N,), (N, d), (N, d) to (N,)."""
 
     def integrand(owner: Indices, theta: Array) -> Array:
@@ -355,7 +359,8 @@ def _discs(radius: Array, mean: Array, sigma: Array) -> Array:
 
 def _normal(u: Array) -> Array:
     """Standard normal density, shape (...)."""
-    return np.exp(-0.5 * u * u) / np.sqrt(2.0 * np.pi)
+    density: Array = np.exp(-0.5 * u * u) / np.sqrt(2.0 * np.pi)
+    return density
 
 
 def _integrate(integrand: Integrand, lower: Array, upper: Array) -> Array:
@@ -364,7 +369,7 @@ def _integrate(integrand: Integrand, lower: Array, upper: Array) -> Array:
     Args:
         integrand: the functions.
         lower: shape (N,).
-        upper: shape (N,), not below ``lower``.
+        upper: shape (N,).
 
     Returns:
         integrals, shape (N,).

@@ -42,6 +42,25 @@ def symmetric(P: Array) -> Array:
     return 0.5 * (P + P.mT)
 
 
+def times_transposed(P: Array, A: Array) -> Array:
+    """``P A'``, shapes (..., n, n) and (m, n) or (..., m, n) to (..., n, m).
+
+    A matrix that the whole batch shares takes one product; NumPy would do as many small ones as there are batches.
+    """
+    if A.ndim > 2:
+        return P @ A.mT
+    n = P.shape[-1]
+    return (P.reshape(-1, n) @ A.T).reshape(*P.shape[:-1], len(A))
+
+
+def squared_norm(w: Array) -> Array:
+    """``w'w``, shape (..., n) to (...), for n small: component by component is faster than many tiny dot products."""
+    total: Array = np.square(w[..., 0])
+    for i in range(1, w.shape[-1]):
+        total = total + np.square(w[..., i])
+    return total
+
+
 def cholesky(P: Array) -> Array:
     """Lower Cholesky factors of ``P``, shape (..., n, n).
 
@@ -76,7 +95,10 @@ def whiten(L: Array, d: Array) -> Array:
 
 def half_log_det(L: Array) -> Array:
     """``0.5 log det P`` from the Cholesky factor ``L`` of P, shape (..., n, n) to (...)."""
-    return np.log(np.diagonal(L, axis1=-2, axis2=-1)).sum(axis=-1)
+    determinant: Array = L[..., 0, 0]
+    for i in range(1, L.shape[-1]):
+        determinant = determinant * L[..., i, i]
+    return np.log(determinant)
 
 
 def log_pdf(at: Array, density: Gaussian) -> Array:
@@ -91,7 +113,7 @@ def log_pdf(at: Array, density: Gaussian) -> Array:
     """
     L = cholesky(density.P)
     w = whiten(L, at - density.x)
-    result: Array = -0.5 * np.vecdot(w, w) - half_log_det(L) - 0.5 * LOG_2PI * L.shape[-1]
+    result: Array = -0.5 * squared_norm(w) - half_log_det(L) - 0.5 * LOG_2PI * L.shape[-1]
     return result
 
 
@@ -115,22 +137,26 @@ def product(factors: Gaussian, members: BoolArray | None = None) -> Product:
     References:
         theory.md Eq. (8), (9); N. Carlson, Federated square root filter (1990).
     """
-    n = factors.x.shape[-1]
-    share: Array = np.ones(factors.x.shape[:-1]) if members is None else members.astype(np.float64)
+    *batch, n_sensors, n = factors.x.shape
     L = cholesky(factors.P)
-    # Rows of W: the columns of L^-1, so that P^-1 = W W'.
+    # Rows of W: the columns of L^-1, so that P^-1 = W W'; side by side they make the sum over the sensors one product.
     W = whiten(L[..., None, :, :], np.eye(n))
-    information = np.einsum("...s,...sik,...sjk->...ij", share, W, W)
+    if members is not None:
+        W = W * members[..., None, None]
+    side_by_side = np.swapaxes(W, -3, -2).reshape(*batch, n, n_sensors * n)
+    information = side_by_side @ side_by_side.mT
     # Relative to the first factor, so that large coordinates cost no digits.
     reference = factors.x[..., :1, :]
-    v = np.einsum("...s,...sik,...sk->...i", share, W, whiten(L, factors.x - reference))
+    v = np.matvec(side_by_side, whiten(L, factors.x - reference).reshape(*batch, n_sensors * n))
     C = cholesky(information)
     V = whiten(C[..., None, :, :], np.eye(n))
     P = V @ V.mT
     x = reference[..., 0, :] + np.matvec(P, v)
     w = whiten(L, x[..., None, :] - factors.x)
-    terms = -0.5 * np.vecdot(w, w) - half_log_det(L) - 0.5 * LOG_2PI * n
-    log_c = (share * terms).sum(axis=-1) - half_log_det(C) + 0.5 * LOG_2PI * n
+    terms = -0.5 * squared_norm(w) - half_log_det(L) - 0.5 * LOG_2PI * n
+    if members is not None:
+        terms = np.where(members, terms, 0.0)
+    log_c = terms.sum(axis=-1) - half_log_det(C) + 0.5 * LOG_2PI * n
     return Product(Gaussian(x, P), log_c)
 
 

@@ -153,7 +153,10 @@ class FusionConfig(_Model):
 
 
 class EverywhereConfig(_Model):
-    """Sees everywhere; the area only gives the density of false plots [m^2, in 3-D m^3]."""
+    """Sees everywhere; the area gives the density of false plots [m^2, in 3-D m^3].
+
+    Simulated false plots fill a square of that area around the origin.
+    """
 
     shape: Literal["everywhere"]
     area: Positive
@@ -228,7 +231,9 @@ class SensorConfig(_Model):
     def view_center(self, stand: Array) -> Array:
         """Center of the field of view of a sensor that stands at ``stand``, shape (d,)."""
         fov = self.field_of_view
-        return stand if isinstance(fov, EverywhereConfig) or fov.center is None else np.array(fov.center)
+        if isinstance(fov, EverywhereConfig):
+            return np.zeros_like(stand)
+        return stand if fov.center is None else np.array(fov.center)
 
 
 class SimulationConfig(_Model):

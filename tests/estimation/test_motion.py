@@ -59,7 +59,9 @@ def test_noise_is_the_integral_of_white_acceleration(dimensions: int, dt: float)
     np.testing.assert_allclose(model.transition(np.array(dt)), expm(A * dt), rtol=1e-12)
 
 
-@given(dt1=INTERVALS, dt2=INTERVALS, dimensions=st.sampled_from(DIMENSIONS), psd=st.sampled_from([0.0, 1e-6, 10.0, 1e4]))
+@given(
+    dt1=INTERVALS, dt2=INTERVALS, dimensions=st.sampled_from(DIMENSIONS), psd=st.sampled_from([0.0, 1e-6, 10.0, 1e4])
+)
 @settings(max_examples=50, deadline=None)
 def test_two_intervals_compose_to_their_sum(dt1: float, dt2: float, dimensions: int, psd: float) -> None:
     model = ConstantVelocity(dimensions, psd)

@@ -1,0 +1,116 @@
+"""The commands of README and how-to's run as they stand there."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+README = (ROOT / "README.md").read_text()
+HOW_TO = (ROOT / "docs/how-to/first-network.md").read_text()
+WALDNET = str(Path(sys.executable).with_name("waldnet"))
+
+
+def blocks(text: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL)
+
+
+def commands(text: str) -> Iterator[list[str]]:
+    """The ``waldnet`` lines of all shell blocks, as words."""
+    for block in blocks(text, "sh"):
+        for line in block.splitlines():
+            if line.startswith("waldnet "):
+                yield [WALDNET, *shlex.split(line, comments=True)[1:]]
+
+
+def section(text: str, title: str) -> str:
+    return next(part for part in re.split(r"^## ", text, flags=re.MULTILINE) if part.startswith(title))
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    harbour = blocks(HOW_TO, "toml")[0]
+    (tmp_path / "harbour.toml").write_text(harbour)
+    (tmp_path / "my-network.toml").write_text(harbour)
+    return tmp_path
+
+
+def run(words: list[str], folder: Path) -> str:
+    done = subprocess.run(words, cwd=folder, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, f"{shlex.join(words)}: {done.stderr}"
+    return done.stdout
+
+
+@pytest.mark.processes
+def test_first_steps_of_the_readme(folder: Path) -> None:
+    steps = list(commands(section(README, "First steps")))
+    assert len(steps) == 5
+    for words in steps:
+        run(words, folder)
+    assert len((folder / "plots.jsonl").read_text().splitlines()) == 120
+
+
+@pytest.mark.processes
+def test_how_to_on_one_machine(folder: Path) -> None:
+    steps = [words for title in ("1.", "2.", "3.") for words in commands(section(HOW_TO, title))]
+    assert len(steps) == 4
+    *_, lines = [run(words, folder) for words in steps]
+    last = {line["track"]: line["status"] for line in map(json.loads, lines.splitlines())}
+    assert last == {0: "confirmed", 1: "deleted"}
+    decisions = json.loads((folder / "harbour-run/decisions.json").read_text())
+    assert {track["track"]: track["status"] for track in decisions["tracks"]} == last
+
+
+def test_the_recorded_plots_of_the_how_to_are_valid(folder: Path) -> None:
+    (folder / "plots.jsonl").write_text(blocks(HOW_TO, "json")[0])
+    assert "2 scans, 2 plots" in run([WALDNET, "check", "harbour.toml", "plots.jsonl"], folder)
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("way", ["direct", "router"])
+def test_how_to_on_several_machines(folder: Path, way: str) -> None:
+    """All on loopback, on a free port, and in lockstep; otherwise as written."""
+    every = list(commands(section(HOW_TO, "4.")))
+    client = [words for words in every if "client" in words]
+    router = [words for words in every if words[1] == "router"]
+    direct = [words for words in every if words not in client and words not in router]
+    assert (len(direct), len(client), len(router)) == (3, 2, 1)
+    client.append([*(word if word != "radar" else "lidar" for word in client[-1])])
+    servers, others = (direct[:1], direct[1:]) if way == "direct" else (router, client)
+    with ExitStack() as stack:
+        port = "0"
+        started = []
+        for words in [*servers, *others]:
+            local = [
+                word.replace("0.0.0.0:7447", "127.0.0.1:0").replace("192.168.1.7:7447", f"127.0.0.1:{port}")
+                for word in words
+            ]
+            pace = ["--speed", "max"] if words[1] == "center" else []
+            process = subprocess.Popen(
+                [*local, *pace], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+            )
+            stack.enter_context(process)
+            stack.callback(process.terminate)
+            started.append((words[1], process))
+            if words in servers:
+                assert process.stdout is not None
+                port = json.loads(process.stdout.readline())["listening"][0].rsplit(":", 1)[1]
+        for kind, process in started:
+            if kind != "router":
+                assert process.wait(60) == 0, kind
+
+
+def test_schema_is_the_one_the_program_prints() -> None:
+    assert (ROOT / "scenarios/scenario.schema.json").read_text() == run([WALDNET, "schema"], ROOT)
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda p: p.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text()):
+        assert (page.parent / target).exists(), target

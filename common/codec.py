@@ -7,6 +7,8 @@ without a loop over tracks. Covariances travel as their upper triangles, row by 
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple, TypeAlias, get_args, get_type_hints
 
@@ -15,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.errors import DecodeError, VersionError
+from common.estimation.sprt import Status
 from common.messages import (
     Advice,
     Clock,
@@ -105,6 +108,9 @@ _MAX_STATE = 64
 #: Messages whose sensor is the one in the key.
 _KEYED = (Report, Scan, Join, Start, Stop)
 
+_TO_WIRE: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "str": str, "tuple": list}
+_EXPECTED = {"int": "a 64-bit integer", "float": "a finite float", "str": "a text", "tuple": "an array of texts"}
+
 _AnyArray: TypeAlias = NDArray[Any]
 
 
@@ -123,8 +129,10 @@ def encode(message: Message) -> bytes:
             sizes[axis.rstrip("^")] = size
         if block.axes[-1].endswith("^"):
             array = array[..., *_upper(array.shape[-1])]
-        raw.append(np.ascontiguousarray(array, dtype=block.dtype).tobytes())
-    scalars = [getattr(message, name) for name, _ in _scalars(kind)]
+        wire = np.ascontiguousarray(array, dtype=block.dtype)
+        assert wire.dtype.kind != "u" or (wire == array).all(), f"{block.field} does not fit into {block.dtype}"
+        raw.append(wire.tobytes())
+    scalars = [_TO_WIRE[hint](getattr(message, name)) for name, hint in _scalars(kind)]
     return bytes(msgpack.packb([VERSION, kind, scalars, list(sizes.values()), b"".join(raw)]))
 
 
@@ -163,7 +171,7 @@ def _decode_body(sensor: str, body: list[Any]) -> Message:
         raise DecodeError(f"{len(body) + 1} elements, expected 5: version, kind, scalars, sizes, blocks")
     kind, scalars, sizes, blocks = body
     if not _is_int(kind) or kind not in LAYOUTS:
-        raise DecodeError(f"kind {kind!r} is unknown")
+        raise DecodeError(f"kind {_shown(kind)} is unknown")
     message, layout = LAYOUTS[kind]
     fields = _decode_scalars(message, _scalars(kind), scalars)
     fields.update(_decode_blocks(layout, sizes, blocks))
@@ -187,11 +195,16 @@ def _decode_scalars(message: type, expected: tuple[tuple[str, str], ...], scalar
         elif hint == "int":
             good = _is_int(value) and -(2**63) <= value < 2**63
             fields[name] = value
+        elif hint == "float":
+            good = isinstance(value, float) and (
+                math.isfinite(value) or (name.startswith("log_") and value == -math.inf)
+            )
+            fields[name] = value
         else:
-            good = isinstance(value, float) if hint == "float" else isinstance(value, str)
+            good = isinstance(value, str)
             fields[name] = value
         if not good:
-            raise DecodeError(f"{name} is a {type(value).__name__}, expected {hint}")
+            raise DecodeError(f"{name} is {_shown(value)}, expected {_EXPECTED[hint]}")
     return fields
 
 
@@ -253,8 +266,19 @@ def _check(message: Message) -> None:
         terms = message.terms
         if (terms < 1).any() or terms.sum() != len(message.log_g):
             raise DecodeError(f"{int(terms.sum())} terms of tracks, {len(message.log_g)} terms sent")
+    if isinstance(message, Tracks):
+        if message.contributing.shape[1] != len(message.sensors):
+            raise DecodeError(f"{message.contributing.shape[1]} contributing sensors, {len(message.sensors)} names")
+        if (message.status > max(Status)).any():
+            raise DecodeError(f"status {int(message.status.max())} is unknown")
     if isinstance(message, Decision) and message.kind not in get_args(DecisionKind):
-        raise DecodeError(f"decision {message.kind!r} is unknown")
+        raise DecodeError(f"decision {_shown(message.kind)} is unknown")
+
+
+def _shown(value: Any) -> str:
+    """A value for an error message, not longer than a line."""
+    text = repr(value)
+    return text if len(text) <= 40 else f"{text[:40]}... ({type(value).__name__})"
 
 
 @cache

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from common.errors import ConfigError
@@ -21,6 +21,8 @@ from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import Thresholds, thresholds
 
 NS_PER_S = 1_000_000_000
+#: Times from the epoch, so that nanoseconds since 1970 fit into 64 bits.
+MAX_SECONDS = 4e9
 
 
 def _probability(value: float) -> float:
@@ -68,24 +70,43 @@ def _false_plots(value: float) -> float:
     return value
 
 
-def _zoned(value: datetime) -> datetime:
-    if value.tzinfo is None:
-        raise ValueError(f"{value.isoformat()} has no time zone; write it like 2026-01-01T00:00:00Z")
+def _seconds(value: float) -> float:
+    if not -MAX_SECONDS <= value <= MAX_SECONDS:
+        raise ValueError(f"{value:g} s is farther from the epoch than {MAX_SECONDS:g} s")
     return value
 
 
-Probability = Annotated[float, AfterValidator(_probability)]
-InnerProbability = Annotated[float, AfterValidator(_inner_probability)]
-GateProbability = Annotated[float, AfterValidator(_gate_probability)]
-Positive = Annotated[float, AfterValidator(_positive)]
-NotNegative = Annotated[float, AfterValidator(_not_negative)]
-Finite = Annotated[float, AfterValidator(_finite)]
-Instant = Annotated[datetime, AfterValidator(_zoned)]
+def _no_number(value: object) -> object:
+    if isinstance(value, int | float):
+        raise ValueError(f"{value!r} is no instant; write it like 2026-01-01T00:00:00Z")
+    return value
+
+
+def _instant(value: datetime) -> datetime:
+    if value.tzinfo is None:
+        raise ValueError(f"{value.isoformat()} has no time zone; write it like 2026-01-01T00:00:00Z")
+    if not 1900 <= value.year <= 2100:
+        raise ValueError(f"{value.isoformat()} is not between the years 1900 and 2100")
+    return value
+
+
+#: A number and nothing that could be read as one, such as true or "0.5".
+_NUMBER = Field(strict=True)
+Probability = Annotated[float, _NUMBER, AfterValidator(_probability)]
+InnerProbability = Annotated[float, _NUMBER, AfterValidator(_inner_probability)]
+GateProbability = Annotated[float, _NUMBER, AfterValidator(_gate_probability)]
+Positive = Annotated[float, _NUMBER, AfterValidator(_positive)]
+NotNegative = Annotated[float, _NUMBER, AfterValidator(_not_negative)]
+Finite = Annotated[float, _NUMBER, AfterValidator(_finite)]
+FalsePlots = Annotated[float, _NUMBER, AfterValidator(_false_plots)]
+Seconds = Annotated[float, _NUMBER, AfterValidator(_finite), AfterValidator(_seconds)]
+Count = Annotated[int, Field(ge=0, strict=True)]
+Instant = Annotated[datetime, BeforeValidator(_no_number), AfterValidator(_instant)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Network(_Model):
@@ -101,8 +122,8 @@ class Network(_Model):
 class Origin(_Model):
     """Origin of the local east-north frame."""
 
-    latitude: Annotated[float, Field(ge=-90.0, le=90.0)]
-    longitude: Annotated[float, Field(ge=-180.0, le=180.0)]
+    latitude: Annotated[float, Field(ge=-90.0, le=90.0, strict=True)]
+    longitude: Annotated[float, Field(ge=-180.0, le=180.0, strict=True)]
 
 
 class MotionConfig(_Model):
@@ -210,10 +231,10 @@ class SensorConfig(_Model):
     position: tuple[Finite, ...] | None = None
     sigma: tuple[Positive, ...]
     p_d: Probability
-    false_plots: Annotated[float, AfterValidator(_false_plots)]
+    false_plots: FalsePlots
     field_of_view: FieldOfViewConfig
     scan_interval: Positive = 1.0
-    first_scan: NotNegative | None = None
+    first_scan: Annotated[NotNegative, AfterValidator(_seconds)] | None = None
 
     def build(self, motion: Motion) -> Sensor:
         """The sensor model for states of a motion model."""
@@ -239,8 +260,8 @@ class SensorConfig(_Model):
 class SimulationConfig(_Model):
     """The simulated world: how long [s], and the seed of everything random."""
 
-    duration: Positive
-    seed: Annotated[int, Field(ge=0)] = 1
+    duration: Annotated[Positive, AfterValidator(_seconds)]
+    seed: Count = 1
 
 
 class RecordingConfig(_Model):
@@ -258,15 +279,15 @@ class TargetConfig(_Model):
         hypothesis: index of the hypothesis whose density it is drawn from.
     """
 
-    start: Finite = 0.0
+    start: Seconds = 0.0
     state: tuple[Finite, ...] | None = None
-    hypothesis: Annotated[int, Field(ge=0)] | None = None
+    hypothesis: Count | None = None
 
 
 class HypothesisConfig(_Model):
     """A track to be decided on: start [s], mean and standard deviations of position and velocity [m, m/s]."""
 
-    start: Finite = 0.0
+    start: Seconds = 0.0
     state: tuple[Finite, ...]
     sigma: tuple[Positive, ...]
 
@@ -389,8 +410,8 @@ def _describe_all(error: ValidationError) -> Iterator[str]:
 def _describe(detail: ErrorDetails) -> str:
     """One fault as ``path: what was got, what was expected``."""
     # A tagged union puts the tag into the location; it is no key of the file.
-    tags = {"everywhere", "box", "disc"}
-    where = ".".join(str(part) for part in detail["loc"] if part not in tags)
+    parts = [str(part) for part in detail["loc"]]
+    where = ".".join(part for i, part in enumerate(parts) if i == 0 or parts[i - 1] != "field_of_view" or i < 3)
     kind, got, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "missing":
         text = "is missing"

@@ -23,6 +23,9 @@ from fusion_center.picture import Fuser, Picture
 #: Wall time between the clock's announcement and its start: nodes on a slow link hear of it in time.
 _LEAD_NS = 50_000_000
 
+#: No position or speed in m, m/s is larger, and no standard deviation smaller than its inverse.
+_LARGEST = 1e15
+
 
 class Presence(NamedTuple):
     """A sensor's liveliness token came or went."""
@@ -211,7 +214,7 @@ class Center:
             case Presence() if event.sensor in self.names:
                 number = self.names.index(event.sensor)
                 state = _with_member(state, number, state.members[number]._replace(alive=event.alive))
-            case Report() if self._fits(state, event):
+            case Report() if self._fits(state, event, now_ns):
                 state, messages = self._accept(state, event, now_ns)
             case Report() | Join():
                 state = _count(state, "refused")
@@ -225,7 +228,9 @@ class Center:
     def deadline_ns(self, state: State) -> int | None:
         """Wall time at which a tick will change something; None: nothing is waited for."""
         if state.clock is None:
-            return state.opened_ns + self.wait_ns
+            # Without anybody there the clock starts with the first to join.
+            joined = any(member.joined for member in state.members)
+            return state.opened_ns + self.wait_ns if joined else None
         if not state.waiting or self.speed == 0.0:
             return None
         return state.waiting[min(state.waiting)].since_ns + self._hold_back_ns
@@ -233,6 +238,10 @@ class Center:
     @property
     def _hold_back_ns(self) -> int:
         return round(self.fusion.hold_back * NS_PER_S)
+
+    @property
+    def _window_ns(self) -> int:
+        return round(self.fusion.window * NS_PER_S)
 
     def _join(self, state: State, join: Join) -> tuple[State, list[Message]]:
         """Answer a sensor with the tracks; one whose process is new gets its own last factors back."""
@@ -270,21 +279,23 @@ class Center:
             P_a=P_a[live],
         )
 
-    def _fits(self, state: State, report: Report) -> bool:
+    def _fits(self, state: State, report: Report, now_ns: int) -> bool:
         """Whether a report comes from a sensor of this network and can be computed with."""
         if report.sensor not in self.names:
             return False
         member = state.members[self.names.index(report.sensor)]
-        n = self.fuser.motion.n
         if not member.joined or report.epoch != member.epoch or report.next_ns <= report.time_ns:
             return False
-        if (len(report.ids) and report.x.shape[-1] != n) or (report.terms != 1).any():
+        if self._ahead(state.clock, report.time_ns, now_ns):
             return False
-        try:
-            np.linalg.cholesky(report.P)
-        except np.linalg.LinAlgError:
+        return report.x.shape[-1] == self.fuser.motion.n and bool((report.terms == 1).all()) and _sound(report)
+
+    def _ahead(self, clock: Clock | None, time_ns: int, now_ns: int) -> bool:
+        """Whether a time lies farther in the future than the window: one wrong clock must not make all others late."""
+        if clock is None or clock.speed == 0.0:
             return False
-        return True
+        present_ns = clock.time_ns + round((now_ns - clock.wall_ns) * clock.speed)
+        return time_ns > present_ns + self._window_ns
 
     def _accept(self, state: State, report: Report, now_ns: int) -> tuple[State, list[Message]]:
         number = self.names.index(report.sensor)
@@ -350,7 +361,7 @@ class Center:
 
     def _forget(self, state: State) -> tuple[State, list[Message]]:
         """Let go of checkpoints older than the window; only now are their deletions final and the nodes told."""
-        oldest_ns = state.time_ns - round(self.fusion.window * NS_PER_S)
+        oldest_ns = state.time_ns - self._window_ns
         keep = bisect_left(state.history, oldest_ns, key=lambda checkpoint: checkpoint.time_ns)
         keep = min(keep, len(state.history) - 1)
         gone, state = state.history[:keep], state._replace(history=state.history[keep:])
@@ -402,6 +413,18 @@ class Center:
             x=picture.fused_x[started],
             P=picture.fused_P[started],
         )
+
+
+def _sound(report: Report) -> bool:
+    """Whether factors can be computed with: positive definite, and far from where squares overflow."""
+    variances = np.diagonal(report.P, axis1=-2, axis2=-1)
+    if (np.abs(report.x) > _LARGEST).any() or (variances > _LARGEST**2).any() or (variances < _LARGEST**-2).any():
+        return False
+    try:
+        np.linalg.cholesky(report.P)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def _with_member(state: State, number: int, member: Member) -> State:

@@ -13,11 +13,13 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from common.config import Scenario
+from common.config import MAX_SECONDS, Scenario
 from common.errors import PlotsError
 from common.estimation.gaussian import Array
 from common.messages import Scan
 
+#: No coordinate is larger; NaN and infinities are none.
+_LARGEST = 1e15
 _KEYS = {"sensor", "time", "plots", "position"}
 
 
@@ -81,6 +83,8 @@ def _parse(line: str, scenario: Scenario) -> Scan:
         entry = json.loads(line)
     except json.JSONDecodeError as error:
         raise ValueError(f"is no JSON: {error.msg} at column {error.colno}") from None
+    except RecursionError:
+        raise ValueError("is no scan: nested too deeply") from None
     if not isinstance(entry, dict):
         raise ValueError(f"is a JSON {type(entry).__name__}, expected an object with sensor, time and plots")
     if missing := sorted({"sensor", "time", "plots"} - entry.keys()):
@@ -90,8 +94,8 @@ def _parse(line: str, scenario: Scenario) -> Scan:
     name, time = entry["sensor"], entry["time"]
     if name not in scenario.sensor_names:
         raise ValueError(f"sensor: {name!r} is not one of {', '.join(scenario.sensor_names)}")
-    if not _is_number(time):
-        raise ValueError(f"time: {time!r} is not a finite number of seconds")
+    if not _is_number(time) or abs(time) > MAX_SECONDS:
+        raise ValueError(f"time: {time!r} is not a number of seconds between -{MAX_SECONDS:g} and {MAX_SECONDS:g}")
     sensor = scenario.sensor(name)
     d = scenario.motion.dimensions
     position = sensor.stand(d) if entry.get("position") is None else _numbers(entry["position"], d, "position")
@@ -110,4 +114,4 @@ def _numbers(value: Any, size: int, where: str) -> Array:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST

@@ -59,12 +59,14 @@ class State(NamedTuple):
         sequence: number of the next report.
         tracks: the tracks.
         recent: scans of the last few seconds, oldest first, for tracks and advice that come late.
+        advice: not followed yet, oldest first.
     """
 
     epoch: int
     sequence: int
     tracks: Tracks
     recent: tuple[Scan, ...]
+    advice: tuple[Advice, ...] = ()
 
 
 class Schedule(NamedTuple):
@@ -147,6 +149,7 @@ class LocalTracker:
 
     def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report]:
         """Filter one scan and report every track that started before it."""
+        state = self._follow_advice(state, scan.time_ns)
         live = state.tracks.times_ns < scan.time_ns
         filtered = self._filter(take(state.tracks, live), scan)
         tracks = filtered if live.all() else put(state.tracks, live, filtered)
@@ -163,17 +166,18 @@ class LocalTracker:
             x=filtered.x,
             P=filtered.P,
         )
-        return State(state.epoch, state.sequence + 1, tracks, (*kept, scan)), report
+        return State(state.epoch, state.sequence + 1, tracks, (*kept, scan), state.advice), report
 
     def start(self, state: State, start: Start) -> State:
-        """Take over tracks, and catch up on the scans since their start."""
-        known = np.isin(start.ids, state.tracks.ids) & (start.epoch <= state.epoch)
+        """Take over tracks, and catch up on the scans since their start; a higher epoch names all tracks there are."""
+        if start.epoch > state.epoch:
+            state = state._replace(tracks=self.initial().tracks)
+        known = np.isin(start.ids, state.tracks.ids)
         fresh = self._fresh(start, ~known)
         for scan in state.recent:
             due = fresh.times_ns < scan.time_ns
             fresh = put(fresh, due, self._filter(take(fresh, due), scan))
-        stays = ~np.isin(state.tracks.ids, fresh.ids)
-        tracks = concatenate(take(state.tracks, stays), fresh)
+        tracks = concatenate(state.tracks, fresh)
         tracks = take(tracks, np.argsort(tracks.ids))
         return state._replace(epoch=max(state.epoch, start.epoch), tracks=tracks)
 
@@ -182,10 +186,19 @@ class LocalTracker:
         return state._replace(tracks=take(state.tracks, ~np.isin(state.tracks.ids, stop.ids)))
 
     def advise(self, state: State, advice: Advice) -> State:
-        """Set the association filters to the fused tracks and redo the scans since (theory.md §6).
+        """Keep advice for the next scan after its time (theory.md §6)."""
+        return state._replace(advice=(*state.advice, advice))
 
-        The factors never see the advice: nothing is counted twice.
+    def _follow_advice(self, state: State, t_ns: int) -> State:
+        """Set the association filters to the newest fused tracks from before ``t_ns`` and redo the scans since.
+
+        The factors never see the advice: nothing is counted twice. Advice may be from ahead of a slow node; it waits.
         """
+        past = [advice for advice in state.advice if advice.time_ns < t_ns]
+        if not past:
+            return state
+        advice = max(past, key=lambda advice: advice.time_ns)
+        state = state._replace(advice=tuple(later for later in state.advice if later.time_ns >= t_ns))
         tracks = state.tracks
         _, mine, given = np.intersect1d(tracks.ids, advice.ids, assume_unique=True, return_indices=True)
         x_a, P_a, times = tracks.x_a.copy(), tracks.P_a.copy(), tracks.times_a_ns.copy()

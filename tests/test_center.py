@@ -88,8 +88,8 @@ def test_the_clock_begins_when_all_sensors_are_there(speed: float) -> None:
 
 def test_the_clock_begins_after_the_wait_with_those_who_joined() -> None:
     stage = Stage(scenario(), wait_s=10.0)
-    assert stage.center.deadline_ns(stage.state) == 10 * NS_PER_S
     stage.join("b", 2.0, at_s=3.0)
+    assert stage.center.deadline_ns(stage.state) == 10 * NS_PER_S
     assert only(Clock, stage.tick(9.9)) == []
     assert len(only(Clock, stage.tick(10.0))) == 1
     assert times_s(stage, stage.tell(stage.report("b", 2.0), 10.1)) == [2.0]
@@ -336,6 +336,21 @@ def test_a_scan_without_a_track_leaves_its_ratio_alone() -> None:
     np.testing.assert_allclose(stage.tracks.log_lr, [2.0, 0.0], atol=1e-9)
 
 
+def test_a_report_of_the_time_a_track_starts_is_too_early_for_it() -> None:
+    stage = alone(hypothesis=[hypothesis_table(start=2.0)], decision=UNDECIDED)
+    stage.tell(stage.report("a", 2.0, **evidence(5.0)))
+    assert stage.tracks.scans.tolist() == [0]
+    assert stage.tracks.log_lr.tolist() == [0.0]
+
+
+def test_only_sensors_that_reported_at_this_time_contribute() -> None:
+    stage = pair(speed=0.0, decision=UNDECIDED)
+    stage.tell(stage.report("a", 2.0))
+    stage.tell(stage.report("b", 2.0, 6.0))
+    stage.tell(stage.report("a", 4.0))
+    assert [tracks.contributing.tolist() for tracks in only(Tracks, stage.said)] == [[[True, True]], [[True, False]]]
+
+
 # Loss, repetition, refusal --------------------------------------------------------------------------------------------
 
 
@@ -387,13 +402,22 @@ def test_a_report_older_than_the_window_is_counted_and_dropped() -> None:
     stage = pair(fusion={"window": 4.0}, decision=UNDECIDED)
     stage.tell(Presence("b", alive=False))
     for time_s in (2.0, 4.0, 6.0, 8.0):
-        stage.tell(stage.report("a", time_s))
+        stage.tell(stage.report("a", time_s), time_s)
     before = stage.tracks
     assert stage.tell(stage.report("b", 2.0, **evidence(50.0)), 100.0) == []
     assert stage.state.counts.too_late == 1
     assert same(stage.tracks, before)
     assert only(Tracks, stage.tell(stage.report("b", 4.0, **evidence(50.0)), 100.0))
     assert stage.state.counts.late == 1
+
+
+def test_a_wrong_clock_makes_nobody_else_late() -> None:
+    stage = pair(fusion={"window": 4.0}, decision=UNDECIDED)
+    assert stage.tell(stage.report("a", 86_400.0), 0.1) == []
+    assert stage.state.counts.refused == 1
+    stage.tell(stage.report("b", 2.0), 0.2)
+    assert stage.tell(stage.report("a", 2.0), 0.3)
+    assert stage.state.counts.late == 0
 
 
 def test_a_late_report_may_have_a_time_of_its_own() -> None:

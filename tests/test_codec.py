@@ -307,8 +307,8 @@ ENVELOPES = [
     ("kind as truth", altered(GOLDEN_REPORT, kind=True), "kind True is unknown"),
     ("scalars missing", altered(GOLDEN_REPORT, scalars=[1, 2]), "expected the 4 scalars of a Report"),
     ("scalars no list", altered(GOLDEN_REPORT, scalars=4), "expected the 4 scalars of a Report"),
-    ("time as float", altered(GOLDEN_REPORT, scalars=[0, 1.0, 2, 1]), "time_ns is a float, expected int"),
-    ("epoch as truth", altered(GOLDEN_REPORT, scalars=[0, 1, 2, True]), "epoch is a bool, expected int"),
+    ("time as float", altered(GOLDEN_REPORT, scalars=[0, 1.0, 2, 1]), "time_ns is 1.0, expected a 64-bit integer"),
+    ("epoch as truth", altered(GOLDEN_REPORT, scalars=[0, 1, 2, True]), "epoch is True, expected a 64-bit integer"),
     ("time too large", altered(GOLDEN_REPORT, scalars=[0, 2**63, 2, 1]), "time_ns is "),
     ("sizes missing", altered(GOLDEN_REPORT, sizes=[1, 1]), "expected the sizes of the axes T, N, n"),
     ("size negative", altered(GOLDEN_REPORT, sizes=[1, -1, 2]), "expected the sizes of the axes T, N, n"),
@@ -331,6 +331,12 @@ def test_what_is_wrong_is_said(payload: bytes, reason: str) -> None:
     text = refusal(payload)
     assert text.startswith(f"waldnet/coast/sensor/radar-1/report: {len(payload)} bytes are no message: ")
     assert reason in text
+
+
+@pytest.mark.parametrize("sensors", [["radar-1", 2, "radar-3"], "abc", None])
+def test_sensors_that_are_no_names_are_refused(sensors: Any) -> None:
+    payload = altered(MESSAGES["tracks-1"], scalars=[EPOCH_NS, sensors])
+    assert f"sensors is {sensors!r}, expected an array of texts" in refusal(payload, KEYS.tracks())
 
 
 def test_an_unknown_decision_is_refused() -> None:

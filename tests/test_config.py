@@ -218,7 +218,7 @@ FAULTS = [
     (
         "p_d = 0.5",
         'p_d = "often"',
-        "sensor.0.p_d: got 'often': input should be a valid number, unable to parse string as a number",
+        "sensor.0.p_d: got 'often': input should be a valid number",
     ),
     ("sigma = [50.0, 40.0]", "sigma = [50.0, 0.0]", "sensor.0.sigma.1: 0 is not positive and finite"),
     (

@@ -98,7 +98,7 @@ def test_a_simulated_world_comes_back_from_its_file(tmp_path: Path) -> None:
     assert all_same(read(tmp_path, written(scans)), scans)
 
 
-number = st.floats(allow_nan=False, allow_infinity=False)
+number = st.floats(-1e15, 1e15)
 
 
 @settings(deadline=None, derandomize=True, database=None)
@@ -130,11 +130,14 @@ BAD = [
     ({**LINE, "sensor": "c"}, "sensor: 'c' is not one of a, b"),
     ({**LINE, "sensor": 1}, "sensor: 1 is not one of a, b"),
     ({**LINE, "sensor": ["a"]}, "sensor: ['a'] is not one of a, b"),
-    ({**LINE, "time": "2"}, "time: '2' is not a finite number of seconds"),
-    ({**LINE, "time": True}, "time: True is not a finite number of seconds"),
-    ({**LINE, "time": None}, "time: None is not a finite number of seconds"),
-    ('{"sensor": "a", "time": NaN, "plots": []}', "time: nan is not a finite number of seconds"),
-    ('{"sensor": "a", "time": -Infinity, "plots": []}', "time: -inf is not a finite number of seconds"),
+    ({**LINE, "time": "2"}, "time: '2' is not a number of seconds between -4e+09 and 4e+09"),
+    ({**LINE, "time": True}, "time: True is not a number of seconds between -4e+09 and 4e+09"),
+    ({**LINE, "time": None}, "time: None is not a number of seconds between -4e+09 and 4e+09"),
+    ('{"sensor": "a", "time": NaN, "plots": []}', "time: nan is not a number of seconds between -4e+09 and 4e+09"),
+    (
+        '{"sensor": "a", "time": -Infinity, "plots": []}',
+        "time: -inf is not a number of seconds between -4e+09 and 4e+09",
+    ),
     ({**LINE, "plots": 3}, "plots: 3 is not a list of plots"),
     ({**LINE, "plots": {"0": [1, 2]}}, "plots: {'0': [1, 2]} is not a list of plots"),
     ({**LINE, "plots": [1, 2]}, "plots.0: 1 is not a list of 2 finite numbers"),
@@ -169,8 +172,8 @@ def test_numbers_and_nesting_beyond_all_bounds(tmp_path: Path, line: str) -> Non
 
 
 def test_a_plot_may_be_a_large_whole_number(tmp_path: Path) -> None:
-    (scan,) = read(tmp_path, '{"sensor": "a", "time": 1, "plots": [[18446744073709551616, 1]]}')
-    assert scan.z.tolist() == [[2.0**64, 1.0]]
+    (scan,) = read(tmp_path, '{"sensor": "a", "time": 1, "plots": [[1000000000000000, 1]]}')
+    assert scan.z.tolist() == [[1e15, 1.0]]
 
 
 def test_a_scan_that_is_there_twice(tmp_path: Path) -> None:

@@ -112,7 +112,7 @@ def test_a_start_that_comes_in_parts_in_any_order_is_one_start() -> None:
 
 
 def test_the_buffer_ends_with_the_window() -> None:
-    plot = world(fusion={"window": 5.0})
+    plot = world(fusion={"window": 4.0})
     scans = simulate(plot, "a", 1)
     late = node(plot)
     for scan in scans[:5]:
@@ -211,15 +211,13 @@ def test_a_higher_epoch_replaces_tracks() -> None:
     again = start(plot, 1.0, ids=[1], epoch=6, x=PLACES[::-1])._replace(log_p_bar=np.array([2.5]))
     keeper = node(plot, start(plot, 0.0, 0.0, epoch=5))
     keeper.scan(scan_at(plot, 2.0, (300.0, 0.0)))
-    stays = keeper.state.tracks
     keeper.start(again)
     fresh = node(plot)
     fresh.scan(scan_at(plot, 2.0, (300.0, 0.0)))
     fresh.start(again)
     assert keeper.state.epoch == 6
-    assert keeper.state.tracks.ids.tolist() == [0, 1]
-    assert close(Tracks(*(array[:1] for array in keeper.state.tracks)), Tracks(*(array[:1] for array in stays)))
-    assert close(Tracks(*(array[1:] for array in keeper.state.tracks)), fresh.state.tracks)
+    assert keeper.state.tracks.ids.tolist() == [1]
+    assert close(keeper.state.tracks, fresh.state.tracks)
 
 
 def test_a_new_track_of_the_same_epoch_joins_the_others() -> None:
@@ -331,6 +329,17 @@ def test_a_track_that_the_sensor_cannot_see_is_left_alone(association: str) -> N
         np.testing.assert_allclose(report.x, far)
 
 
+@pytest.mark.parametrize(("association", "share"), [("tight", 1.0), ("factor", 2.0)])
+def test_at_the_edge_the_filter_that_associates_says_how_much_is_seen(association: str, share: float) -> None:
+    plot = world(association=association)
+    inside = 50.0
+    keeper = node(plot, start(plot, 0.0, x=np.array([[10_000.0 - inside, 0.0, 0.0, 0.0]])))
+    report = keeper.scan(scan_at(plot, 2.0))
+    sigma = np.sqrt(share * (1e4 + 400.0 * 2.0**2 + 10.0 * 2.0**3 / 3.0))
+    p_d = 0.9 * stats.norm.cdf(inside / sigma)
+    np.testing.assert_allclose(report.log_g, np.log(1.0 - p_d * plot.fusion.gate_probability), rtol=1e-9)
+
+
 def test_the_field_of_view_moves_with_the_sensor() -> None:
     sensors = [sensor_table("a", field_of_view={"shape": "disc", "radius": 2000.0}), sensor_table("b")]
     plot = scenario(*sensors)
@@ -380,22 +389,25 @@ def test_late_advice_is_as_good_as_advice_in_time(late: int) -> None:
             in_time.state = in_time.tracker.advise(in_time.state, advice)
         if number == 2 + late:
             delayed.state = delayed.tracker.advise(delayed.state, advice)
+        in_time.scan(scan)
+        delayed.scan(scan)
+        if number >= 2 + late:
             for field in ("x_a", "P_a", "times_a_ns"):
                 one, other = getattr(in_time.state.tracks, field), getattr(delayed.state.tracks, field)
                 np.testing.assert_allclose(one, other, rtol=1e-12)
-        in_time.scan(scan)
-        delayed.scan(scan)
     assert not np.allclose(in_time.state.tracks.log_p_bar, delayed.state.tracks.log_p_bar, rtol=1e-12)
 
 
 def test_advice_never_touches_the_factors() -> None:
     plot = world(fusion={"feedback": "advice"})
     keeper = node(plot, start(plot, 0.0, 0.0))
-    for scan in simulate(plot, "a", 1)[:3]:
+    *scans, last = simulate(plot, "a", 1)[:4]
+    for scan in scans:
         keeper.scan(scan)
-    before = keeper.state.tracks
-    keeper.state = keeper.tracker.advise(keeper.state, advice_at(plot, 4.0, 1))
-    after = keeper.state.tracks
+    nothing = last._replace(z=last.z[:0])
+    unadvised = keeper.tracker.scan(keeper.state, nothing, NEVER)[0]
+    advised = keeper.tracker.advise(keeper.state, advice_at(plot, 4.0, 1))
+    before, after = unadvised.tracks, keeper.tracker.scan(advised, nothing, NEVER)[0].tracks
     for field in ("ids", "times_ns", "log_p_bar", "x", "P"):
         assert np.array_equal(getattr(before, field), getattr(after, field))
     assert np.array_equal(before.x_a[0], after.x_a[0])
@@ -406,11 +418,10 @@ def test_advice_on_unknown_tracks_is_nothing() -> None:
     plot = world(fusion={"feedback": "advice"})
     keeper = node(plot, start(plot, 0.0))
     keeper.scan(scan_at(plot, 2.0))
-    before = keeper.state.tracks
-    keeper.state = keeper.tracker.advise(keeper.state, advice_at(plot, 2.0, 5, 9))
-    assert close(keeper.state.tracks, before)
-    keeper.state = keeper.tracker.advise(keeper.state, advice_at(plot, 2.0))
-    assert close(keeper.state.tracks, before)
+    unadvised = keeper.tracker.scan(keeper.state, scan_at(plot, 4.0), NEVER)[0]
+    for advice in (advice_at(plot, 2.0, 5, 9), advice_at(plot, 2.0)):
+        advised = keeper.tracker.advise(keeper.state, advice)
+        assert close(keeper.tracker.scan(advised, scan_at(plot, 4.0), NEVER)[0].tracks, unadvised.tracks)
 
 
 def test_advice_from_ahead_of_the_sensor_is_no_way_back_in_time() -> None:

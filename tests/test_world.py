@@ -151,10 +151,10 @@ def test_two_targets_of_one_hypothesis_are_drawn_apart() -> None:
 def test_a_target_is_detected_with_p_d() -> None:
     targets = [{"state": [0.0, 0.0, 0.0, 0.0]}] * 20
     plot = scenario(
-        sensor_table(p_d=0.3, false_plots=1e-9, field_of_view=FAR), target=targets, simulation={"duration": 400.0}
+        sensor_table(p_d=0.5, false_plots=1e-9, field_of_view=FAR), target=targets, simulation={"duration": 400.0}
     )
     plots = sum(len(scan.z) for scan in simulate(plot, "a", 5))
-    assert stats.binomtest(plots, 20 * 200, 0.3).pvalue > ALPHA
+    assert stats.binomtest(plots, 20 * 200, 0.5).pvalue > ALPHA
 
 
 def test_false_plots_are_poisson() -> None:
@@ -182,7 +182,8 @@ def test_false_plots_are_uniform_in_the_field_of_view(fov: dict[str, Any]) -> No
         target=[],
         simulation={"duration": 200.0},
     )
-    z = np.concatenate([scan.z for scan in simulate(plot, "a", 5)]) - fov.get("center", [7000.0, 8000.0])
+    center = [0.0, 0.0] if fov["shape"] == "everywhere" else fov.get("center", [7000.0, 8000.0])
+    z = np.concatenate([scan.z for scan in simulate(plot, "a", 5)]) - center
     if fov["shape"] == "disc":
         radius = np.linalg.norm(z, axis=-1)
         assert stats.kstest(radius**2 / 300.0**2, "uniform").pvalue > ALPHA

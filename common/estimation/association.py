@@ -1,7 +1,8 @@
 """Plots and tracks: gate, PDAF update with its weight sum, tight association.
 
 Everything is done in whitened coordinates: with ``S_k = L L'``, ``w_j = L^-1 nu_j`` and ``W = P H' L^-T`` the gain
-times an innovation is ``K nu = W w`` and ``K S_k K' = W W'``, so that Eq. (7) needs neither K nor S_k.
+times an innovation is ``K nu = W w`` and ``K S_k K' = W W'``, so that Eq. (7) needs neither K nor S_k. ``P - K S_k K'`` is
+computed in Joseph's form: the plain difference loses all digits where a sharp plot meets a wide prior.
 """
 
 from __future__ import annotations
@@ -59,12 +60,16 @@ class Innovations(NamedTuple):
     Attributes:
         w: whitened innovations, shape (..., M, m).
         W: whitened gain, shape (..., n, m).
+        J: whitened Jacobian L^-1 H, shape (..., m, n).
+        M: whitened measurement noise L^-1 R L^-T, shape (..., m, m).
         distance: squared Mahalanobis distances, shape (..., M).
         log_pdf: log N(z_j; z_hat, S_k), shape (..., M).
     """
 
     w: Array
     W: Array
+    J: Array
+    M: Array
     distance: Array
     log_pdf: Array
 
@@ -98,7 +103,9 @@ def innovate(predicted: Gaussian, z: Array, sensor: Linearised) -> Innovations:
     w = whiten(L_plot, z - sensor.z[..., None, :])
     distance = squared_norm(w)
     log_pdf = -0.5 * distance - half_log_det(L)[..., None] - 0.5 * LOG_2PI * L.shape[-1]
-    return Innovations(w, whiten(L_plot, PH), distance, log_pdf)
+    J = whiten(L_plot, sensor.H.mT).mT
+    M = whiten(L_plot, whiten(L_plot, sensor.R).mT)
+    return Innovations(w, whiten(L_plot, PH), J, M, distance, log_pdf)
 
 
 @cache
@@ -159,12 +166,15 @@ def absorb(predicted: Gaussian, innovations: Innovations, p: Array) -> Gaussian:
         the posterior Gaussians.
     """
     w, W, hit = innovations.w, innovations.W, p[..., 1:]
+    # Padding may hold anything, and 0 times NaN is no zero.
+    w = np.where(hit[..., None] > 0.0, w, 0.0)
     weighted = hit[..., None] * w
     mean = weighted.sum(axis=-2)
     spread = weighted.mT @ w - mean[..., :, None] * mean[..., None, :]
-    # P - (1-p_0) K S K' + K (spread) K' with both terms between the same gains.
-    shrink = (1.0 - p[..., 0])[..., None, None] * np.eye(w.shape[-1]) - spread
-    return Gaussian(predicted.x + np.matvec(W, mean), symmetric(predicted.P - W @ shrink @ W.mT))
+    # Joseph's form: P - W W' = A P A' + W M W', every term positive semidefinite.
+    A = np.eye(W.shape[-2]) - W @ innovations.J
+    rest = innovations.M + p[..., 0, None, None] * np.eye(w.shape[-1]) + spread
+    return Gaussian(predicted.x + np.matvec(W, mean), symmetric(A @ predicted.P @ A.mT + W @ rest @ W.mT))
 
 
 def pdaf(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter) -> Filtered:

@@ -314,12 +314,14 @@ def _cuboid_by_slices(lower: Array, upper: Array, c: Array, rho: Array) -> Array
         a, b = (lower[owner, None, 1:] - mean) / sigma, (upper[owner, None, 1:] - mean) / sigma
         return _normal(u) * _rectangle(a, b, rho[owner, None])
 
-    # Only where the mean of every other axis given u is near its sides: a thin cigar shows up in few slices.
-    slope = np.where(np.abs(c) < 1e-9, 1e-9, c)
-    ends = np.stack([lower[:, 1:] - _CERTAIN * s, upper[:, 1:] + _CERTAIN * s]) / slope
-    start = np.maximum(ends.min(axis=0).max(axis=-1), np.maximum(lower[:, 0], -_CERTAIN))
-    stop = np.minimum(ends.max(axis=0).min(axis=-1), np.minimum(upper[:, 0], _CERTAIN))
-    return _integrate(integrand, start, stop)
+    # Another axis crosses its sides within a few s / |c|. Panels end where a crossing begins and where it ends, or those
+    # of a thin cigar would slip between the nodes.
+    slope = np.where(np.abs(c) < 1e-9, 1e-9, c)[:, None]
+    sides, reach = np.stack([lower[:, 1:], upper[:, 1:]], axis=1) / slope, _CERTAIN * s[:, None] / slope
+    crossings = np.concatenate([sides - reach, sides + reach], axis=1).reshape(-1, 8)
+    limits = np.clip(np.stack([lower[:, 0], upper[:, 0]], axis=-1), -_CERTAIN, _CERTAIN)
+    breaks = np.clip(np.concatenate([limits, crossings], axis=-1), limits[:, :1], limits[:, 1:])
+    return _integrate(integrand, np.sort(breaks, axis=-1))
 
 
 def _ball(radius: Array, mean: Array, sigma: Array) -> Array:
@@ -353,8 +355,8 @@ def _ball_by_slices(radius: Array, mean: Array, sigma: Array) -> Array:
         return density * slice_radius * _ball(slice_radius, m[..., 1:], s[..., 1:])
 
     reach = _CERTAIN * sigma[:, 0]
-    start, stop = ((mean[:, 0] + side) / radius for side in (-reach, reach))
-    return _integrate(integrand, np.arcsin(np.clip(start, -1.0, 1.0)), np.arcsin(np.clip(stop, -1.0, 1.0)))
+    ends = np.stack([mean[:, 0] - reach, mean[:, 0] + reach], axis=-1) / radius[:, None]
+    return _integrate(integrand, np.arcsin(np.clip(ends, -1.0, 1.0)))
 
 
 def _normal(u: Array) -> Array:
@@ -363,19 +365,19 @@ def _normal(u: Array) -> Array:
     return density
 
 
-def _integrate(integrand: Integrand, lower: Array, upper: Array) -> Array:
-    """Integrate many functions at once, each over its own interval, bisecting panels until they are resolved.
+def _integrate(integrand: Integrand, breaks: Array) -> Array:
+    """Integrate many functions at once, each over its own panels, bisecting these until they are resolved.
 
     Args:
         integrand: the functions.
-        lower: shape (N,).
-        upper: shape (N,).
+        breaks: ends of the panels, ascending, shape (N, panels + 1).
 
     Returns:
         integrals, shape (N,).
     """
-    total = np.zeros_like(lower)
-    owner, a, b = np.arange(lower.size), lower, upper
+    total = np.zeros(len(breaks))
+    owner, panel = np.nonzero(breaks[:, :-1] < breaks[:, 1:])
+    a, b = breaks[owner, panel], breaks[owner, panel + 1]
     whole = _gauss(integrand, owner, a, b)
     for _ in range(_BISECTIONS):
         middle = 0.5 * (a + b)

@@ -84,5 +84,7 @@ def shrink(P: Array, H: Array, R: Array) -> Array:
         updated covariances, shape (..., n, n).
     """
     PH = P @ H.mT
-    W = whiten(cholesky(symmetric(H @ PH) + R)[..., None, :, :], PH)
-    return symmetric(P - W @ W.mT)
+    L = cholesky(symmetric(H @ PH) + R)[..., None, :, :]
+    W = whiten(L, PH)
+    A = np.eye(P.shape[-1]) - W @ whiten(L, H.mT).mT
+    return symmetric(A @ P @ A.mT + W @ whiten(L, whiten(L, R).mT) @ W.mT)

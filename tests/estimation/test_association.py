@@ -255,7 +255,7 @@ def test_padding_may_hold_anything(draw: Draw) -> None:
     assert_same(ours, one.x, one.P, one.log_p_bar)
 
 
-@pytest.mark.parametrize("distance", [1e3, 1e6, 1e12, 1e150, 1e200, 1e300])
+@pytest.mark.parametrize("distance", [1e3, 1e6, 1e12, 1e15, 1e150])
 @pytest.mark.parametrize("p_d", [0.5, 1.0])
 def test_plots_absurdly_far_away_do_no_harm(p_d: float, distance: float, draw: Draw) -> None:
     predicted, wide = draw(np.random.default_rng(7), (), 4), draw(np.random.default_rng(8), (), 4, 3.0)

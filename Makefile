@@ -25,8 +25,10 @@ demo: $(VENV)/user.stamp ## four simulated radars, then a recorded ferry: proces
 	@$(BIN)/waldnet run four-radars --speed 10 --out runs/four-radars
 	@$(BIN)/waldnet run autoferry-5 --speed 10 --out runs/autoferry-5
 	@echo
-	@echo "Look at:"
-	@ls -1 runs/four-radars/* runs/autoferry-5/* | sed 's/^/  /'
+	@echo "Look at, in runs/four-radars and in runs/autoferry-5:"
+	@echo "  log_lr.png      log LR of every hypothesis, until it crossed a threshold and after"
+	@echo "  plan.png        sensors, plots, tracks with 95 % ellipses"
+	@echo "  decisions.json  what was decided when;  tracks.jsonl  every track at every time;  logs/  of the processes"
 
 test: $(VENV)/test.stamp ## all tests
 	$(BIN)/python -m pytest

@@ -2,7 +2,8 @@
 
     python benchmarks/association.py [--runs N]
 
-Mean log LR after the last scan and share of tracks lost (more than 1 km from the truth) in seeded runs; the intervals hold 95 %.
+Mean log LR after the last scan and share of tracks lost (more than 1 km from the truth) in seeded runs; the intervals
+hold 95 %.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
     python benchmarks/estimator.py [--json FILE]
 
 One scan of 6 plots, 2-D, for batches of 1 to 1000 tracks: prediction, gate, PDAF update and log p_bar added up
-(Eq. 5-7); the same with tight association (Eq. 12, 13); and the center's step for 4 sensors (Eq. 8-10). Stone Soup does prediction,
-PDA and update of one track at a time. Figures are medians over repetitions, in microseconds per track and scan; machines differ and
-are noisy: the ratio travels, the microseconds do not.
+(Eq. 5-7); the same with tight association (Eq. 12, 13); and the center's step for 4 sensors (Eq. 8-10). Stone Soup does
+prediction, PDA and update of one track at a time. Figures are medians over repetitions, in microseconds per track and
+scan; machines differ and are noisy: the ratio travels, the microseconds do not.
 """
 
 from __future__ import annotations

@@ -180,7 +180,8 @@ def _decode_body(sensor: str, body: list[Any]) -> Message:
             raise DecodeError(f"a {message.__name__} does not belong on this key")
         fields["sensor"] = sensor
     decoded: Message = message(**fields)
-    _check(decoded)
+    _check_numbers(decoded)
+    _check_counts(decoded)
     return decoded
 
 
@@ -251,8 +252,8 @@ def _shape(flat: _AnyArray, block: Block, size_of: dict[str, int]) -> _AnyArray:
     return full
 
 
-def _check(message: Message) -> None:
-    """What the layout alone cannot say."""
+def _check_numbers(message: Message) -> None:
+    """Finite numbers, ascending ids."""
     for name, value in message._asdict().items():
         if isinstance(value, np.ndarray) and value.dtype == np.float64:
             # log p_bar of a scan that h1 holds for impossible is -inf.
@@ -262,17 +263,21 @@ def _check(message: Message) -> None:
     ids = getattr(message, "ids", None)
     if ids is not None and (np.diff(ids) <= 0).any():
         raise DecodeError("ids are not ascending")
-    if isinstance(message, Report):
-        terms = message.terms
-        if (terms < 1).any() or terms.sum() != len(message.log_g):
-            raise DecodeError(f"{int(terms.sum())} terms of tracks, {len(message.log_g)} terms sent")
-    if isinstance(message, Tracks):
-        if message.contributing.shape[1] != len(message.sensors):
-            raise DecodeError(f"{message.contributing.shape[1]} contributing sensors, {len(message.sensors)} names")
-        if (message.status > max(Status)).any():
-            raise DecodeError(f"status {int(message.status.max())} is unknown")
-    if isinstance(message, Decision) and message.kind not in get_args(DecisionKind):
-        raise DecodeError(f"decision {_shown(message.kind)} is unknown")
+
+
+def _check_counts(message: Message) -> None:
+    """Counts that must agree, numbers that must stand for something."""
+    match message:
+        case Report(terms=terms, log_g=log_g) if (terms < 1).any() or terms.sum() != len(log_g):
+            raise DecodeError(f"{int(terms.sum())} terms of tracks, {len(log_g)} terms sent")
+        case Tracks(contributing=who, sensors=names) if who.shape[1] != len(names):
+            raise DecodeError(f"{who.shape[1]} contributing sensors, {len(names)} names")
+        case Tracks(status=status) if (status > max(Status)).any():
+            raise DecodeError(f"status {int(status.max())} is unknown")
+        case Decision(kind=kind) if kind not in get_args(DecisionKind):
+            raise DecodeError(f"decision {_shown(kind)} is unknown")
+        case _:
+            pass
 
 
 def _shown(value: Any) -> str:

@@ -11,6 +11,7 @@ from rich.console import Console
 from common.codec import decode
 from common.config import Network, Scenario
 from common.errors import DecodeError
+from common.estimation.sprt import Status
 from common.inbox import Exited, Heard, Inbox, Incoming, Present, Stopped
 from common.messages import NEVER, Clock, Decision, Keys, Tracks, sensor_of
 from common.process import stopped_by_signals
@@ -72,10 +73,18 @@ class Run:
                 self._start_all(bus)
                 self._watch(bus)
                 with self._status:
+                    self._greet()
                     self._follow()
                     self._follow_up(bus)
             finally:
                 self._children.end()
+
+    def _greet(self) -> None:
+        scenario = self._order.scenario
+        self._status.say(
+            f"{scenario.name}: the fusion center and {len(scenario.sensors)} sensors run as processes of their own, "
+            f"{len(scenario.hypotheses)} hypotheses to decide on"
+        )
 
     def _start_all(self, bus: Bus) -> None:
         order, here = self._order, bus.endpoints()
@@ -168,4 +177,6 @@ def execute(order: Order, console: Console) -> None:
         run.run()
     finally:
         files = write_report(run.record, order.out, {"seed": order.seed, "speed": order.speed or "max"})
-        console.print(f"report: {', '.join(str(file) for file in files)}", highlight=False, soft_wrap=True)
+        last = [Status(int(history.status[-1])) for history in run.record.histories().values()]
+        outcome = ", ".join(f"{last.count(status)} {status.name.lower()}" for status in Status)
+        console.print(f"tracks: {outcome}\nreport: {', '.join(str(file) for file in files)}", soft_wrap=True)

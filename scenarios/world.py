@@ -1,8 +1,8 @@
 """The simulated world: a function of the scenario and its seed.
 
 Every process derives the same truth from the seed, and its own plots from the seed and the sensor's name; so what
-``waldnet simulate`` writes is what the processes of ``waldnet run`` see. The truth is drawn at the scan times of the network,
-so a sensor with other scan times makes another path of the same seed.
+``waldnet simulate`` writes is what the processes of ``waldnet run`` see. The truth is drawn at the scan times of the
+network, so a sensor with other scan times makes another path of the same seed.
 """
 
 from __future__ import annotations

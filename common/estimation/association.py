@@ -1,8 +1,8 @@
 """Plots and tracks: gate, PDAF update with its weight sum, tight association.
 
 Everything is done in whitened coordinates: with ``S_k = L L'``, ``w_j = L^-1 nu_j`` and ``W = P H' L^-T`` the gain
-times an innovation is ``K nu = W w`` and ``K S_k K' = W W'``, so that Eq. (7) needs neither K nor S_k. ``P - K S_k K'`` is
-computed in Joseph's form: the plain difference loses all digits where a sharp plot meets a wide prior.
+times an innovation is ``K nu = W w`` and ``K S_k K' = W W'``, so that Eq. (7) needs neither K nor S_k. The difference
+``P - K S_k K'`` is computed in Joseph's form: as it stands it loses all digits where a sharp plot meets a wide prior.
 """
 
 from __future__ import annotations
@@ -103,9 +103,11 @@ def innovate(predicted: Gaussian, z: Array, sensor: Linearised) -> Innovations:
     w = whiten(L_plot, z - sensor.z[..., None, :])
     distance = squared_norm(w)
     log_pdf = -0.5 * distance - half_log_det(L)[..., None] - 0.5 * LOG_2PI * L.shape[-1]
-    J = whiten(L_plot, sensor.H.mT).mT
-    M = whiten(L_plot, whiten(L_plot, sensor.R).mT)
-    return Innovations(w, whiten(L_plot, PH), J, M, distance, log_pdf)
+    n, m = PH.shape[-2:]
+    right = np.empty((*PH.shape[:-2], 2 * n + m, m))
+    right[..., :n, :], right[..., n : 2 * n, :], right[..., 2 * n :, :] = PH, sensor.H.mT, sensor.R
+    W, J, M = np.split(whiten(L_plot, right), (n, 2 * n), axis=-2)
+    return Innovations(w, W, J.mT, whiten(L_plot, M.mT), distance, log_pdf)
 
 
 @cache

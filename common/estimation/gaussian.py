@@ -83,12 +83,13 @@ def whiten(L: Array, d: Array) -> Array:
     Returns:
         w, shape (..., n).
     """
-    n = L.shape[-1]
-    w = np.empty(np.broadcast_shapes(L.shape[:-1], d.shape))
-    for i in range(n):
-        rest = d[..., i]
-        for j in range(i):
-            rest = rest - L[..., i, j] * w[..., j]
+    first = d[..., 0] / L[..., 0, 0]
+    w = np.empty((*first.shape, L.shape[-1]))
+    w[..., 0] = first
+    for i in range(1, L.shape[-1]):
+        rest = d[..., i] - L[..., i, 0] * first
+        for j in range(1, i):
+            rest -= L[..., i, j] * w[..., j]
         w[..., i] = rest / L[..., i, i]
     return w
 

@@ -171,7 +171,7 @@ def absorb(predicted: Gaussian, innovations: Innovations, p: Array) -> Gaussian:
     # Padding may hold anything, and 0 times NaN is no zero.
     w = np.where(hit[..., None] > 0.0, w, 0.0)
     weighted = hit[..., None] * w
-    mean = weighted.sum(axis=-2)
+    mean = np.vecmat(hit, w)
     spread = weighted.mT @ w - mean[..., :, None] * mean[..., None, :]
     # Joseph's form: P - W W' = A P A' + W M W', every term positive semidefinite.
     A = np.eye(W.shape[-2]) - W @ innovations.J

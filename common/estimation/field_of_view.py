@@ -314,8 +314,8 @@ def _cuboid_by_slices(lower: Array, upper: Array, c: Array, rho: Array) -> Array
         a, b = (lower[owner, None, 1:] - mean) / sigma, (upper[owner, None, 1:] - mean) / sigma
         return _normal(u) * _rectangle(a, b, rho[owner, None])
 
-    # Another axis crosses its sides within a few s / |c|. Panels end where a crossing begins and where it ends, or those
-    # of a thin cigar would slip between the nodes.
+    # Another axis crosses its sides within a few s / |c|. Panels end where a crossing begins and where it ends: those of
+    # a thin cigar would slip between the nodes.
     slope = np.where(np.abs(c) < 1e-9, 1e-9, c)[:, None]
     sides, reach = np.stack([lower[:, 1:], upper[:, 1:]], axis=1) / slope, _CERTAIN * s[:, None] / slope
     crossings = np.concatenate([sides - reach, sides + reach], axis=1).reshape(-1, 8)

@@ -1,0 +1,120 @@
+"""What a run shows and keeps, and what its shells make of partners that do not fit; without processes."""
+
+from __future__ import annotations
+
+import io
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+from builders import Stage, reports_of, scenario
+from process_helpers import PATIENCE_S, variant
+from rich.console import Console
+
+from common.codec import encode
+from common.config import load_scenario
+from common.errors import ConfigError, WaldnetError
+from common.estimation.sprt import Status
+from common.messages import Keys, Scan, Start, Tracks
+from common.transport import MemoryNetwork
+from launch.status import LiveStatus
+from sensor_node.shell import NodeShell
+from sensor_node.tracker import LocalTracker
+from studies.record import Record
+
+
+def picture(time_s: float, tracks: dict[int, Status]) -> Tracks:
+    count = len(tracks)
+    return Tracks(
+        time_ns=scenario().to_ns(time_s),
+        sensors=("a", "b"),
+        ids=np.array(list(tracks), np.int64),
+        status=np.array(list(tracks.values()), np.uint8),
+        scans=np.ones(count, np.int64),
+        contributing=np.ones((count, 2), np.bool_),
+        log_lr=np.zeros(count),
+        log_lr_total=np.zeros(count),
+        x=np.zeros((count, 4)),
+        P=np.tile(np.eye(4), (count, 1, 1)),
+    )
+
+
+def test_the_live_status_misses_nothing_between_two_refreshes() -> None:
+    screen, plot = io.StringIO(), scenario()
+    status = LiveStatus(Record(plot), plot.to_ns(20.0), Console(file=screen, force_terminal=True, width=120))
+    with status:
+        status.picture(picture(2.0, {0: Status.CONFIRMED, 1: Status.DELETED}))
+        status.picture(picture(4.0, {0: Status.CONFIRMED}))
+    assert "deleted" in screen.getvalue()
+
+
+def test_what_is_said_into_a_file_is_one_line() -> None:
+    file, plot = io.StringIO(), scenario()
+    LiveStatus(Record(plot), plot.to_ns(20.0), Console(file=file, width=80)).say(30 * "a long story ")
+    assert file.getvalue().count("\n") == 1
+
+
+def test_a_deletion_that_a_late_report_brings_forward_is_kept() -> None:
+    """The picture of that time must be told anew, or the track would be tentative in the record for ever."""
+    stage = Stage(scenario(), speed=1.0)
+    starts = stage.join_all()
+    scans = [
+        Scan(name, stage.ns(time_s), np.zeros(2), np.empty((0, 2)))
+        for time_s in (2.0, 4.0, 6.0)
+        for name in stage.scenario.sensor_names
+    ]
+    first_a, first_b, second_a, second_b, *_ = reports_of(stage.scenario, starts, scans)
+    stage.tell(first_a, 0.1)
+    stage.tick(1.0)
+    stage.tell(second_a, 2.1)
+    stage.tell(second_b, 2.1)
+    assert [(decision.kind, stage.scenario.to_seconds(decision.time_ns)) for decision in stage.decisions] == [
+        ("deleted", 4.0)
+    ]
+    stage.tell(first_b, 2.2)
+    record = Record(stage.scenario)
+    for message in stage.said:
+        record.note(message)
+    assert [(decision.kind, stage.scenario.to_seconds(decision.time_ns)) for decision in record.standing()] == [
+        ("deleted", 2.0)
+    ]
+    assert record.summary({})["tracks"][0]["status"] == "deleted"
+
+
+def test_whoever_joins_a_lockstep_late_does_not_stop_it() -> None:
+    stage = Stage(scenario(), wait_s=0.0)
+    stage.join("a", 2.0)
+    stage.tell(stage.report("a", 2.0))
+    assert stage.clear_s == [2.0, 4.0]
+    stage.join("b", 2.0)
+    stage.tell(stage.report("a", 4.0))
+    stage.join("b", 4.0)
+    assert stage.clear_s[-1] == 4.0
+    stage.tell(stage.report("b", 4.0))
+    assert stage.clear_s[-1] == 6.0
+    assert stage.clear_s == sorted(stage.clear_s)
+
+
+def test_a_node_refuses_tracks_of_another_dimension() -> None:
+    memory, plot = MemoryNetwork(), scenario()
+    keys, here = Keys(plot.network.name), threading.Event()
+    center = memory.bus()
+    center.watch(keys.sensor_alive(), lambda *_: here.set())
+    commands = center.publisher(keys.command("a"))
+    shell = NodeShell(memory.bus(), plot.network, LocalTracker.of(plot, "a"), [], patience_s=PATIENCE_S)
+    one, x, P = np.ones(1), np.zeros((1, 6)), np.eye(6)[None]
+    with ThreadPoolExecutor(1) as pool:
+        running = pool.submit(shell.run)
+        assert here.wait(PATIENCE_S)
+        commands.put(encode(Start("a", 1, np.array([0]), np.array([0]), one, x, P, x, P)))
+        shell.stop()
+        with pytest.raises(WaldnetError, match="same scenario"):
+            running.result(PATIENCE_S)
+
+
+def test_no_sensor_may_be_called_like_the_center(tmp_path: Path) -> None:
+    """A run keeps its children and their logs by name."""
+    with pytest.raises(ConfigError, match=r"sensor\.0\.name: 'center'"):
+        load_scenario(variant(tmp_path, "taken", ('name = "radar-1"', 'name = "center"')))

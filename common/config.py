@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import tomllib
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
@@ -348,6 +349,12 @@ class Scenario(_Model):
         raise ConfigError(f"{self.name}: no sensor {name!r}; there are {', '.join(self.sensor_names)}")
 
     @property
+    def digest(self) -> str:
+        """Of what node and center must have in common, or LR would be wrong without a word: models, fusion, sensors."""
+        common = self.model_dump_json(include={"epoch", "motion", "fusion", "sensors"})
+        return hashlib.sha256(common.encode()).hexdigest()[:16]
+
+    @property
     def share(self) -> Share:
         """A sensor's share of prior and process noise."""
         return Share(1.0 if self.fusion.mode == "naive" else float(len(self.sensors)))
@@ -479,6 +486,8 @@ def _repeated_names(sensors: list[Mapping[str, Any]]) -> Iterator[str]:
         name = sensor.get("name")
         if isinstance(name, str) and name in seen:
             yield f"sensor.{i}.name: {name!r} is taken already"
+        if name == "center":
+            yield f"sensor.{i}.name: 'center' is the name of the fusion center"
         seen.add(name if isinstance(name, str) else None)
 
 

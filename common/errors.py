@@ -7,7 +7,8 @@
     ├── PlotsError           a file of recorded plots is wrong; file and line named
     ├── DecodeError          bytes that are no message of ours
     │   └── VersionError     a message of another wire version
-    └── TransportError       the network: endpoint taken, nothing answers
+    ├── TransportError       the network: endpoint taken, nothing answers
+    └── LaunchError          a process of a run did not start, or died (launch/processes.py)
 """
 
 from __future__ import annotations

@@ -28,6 +28,13 @@ class Missed(NamedTuple):
     number: int
 
 
+class Said(NamedTuple):
+    """A child process said where it listens."""
+
+    name: str
+    listening: tuple[str, ...]
+
+
 class Exited(NamedTuple):
     """A child process ended."""
 
@@ -43,7 +50,7 @@ class Elapsed(NamedTuple):
     """Nothing came in until the time asked for."""
 
 
-Incoming: TypeAlias = Heard | Present | Missed | Exited | Stopped | Elapsed
+Incoming: TypeAlias = Heard | Present | Missed | Said | Exited | Stopped | Elapsed
 
 
 class Inbox:
@@ -64,6 +71,10 @@ class Inbox:
     def missed(self, key: str, number: int) -> None:
         """Put a loss."""
         self._queue.put(Missed(key, number))
+
+    def said(self, name: str, listening: tuple[str, ...]) -> None:
+        """Put where a child process listens."""
+        self._queue.put(Said(name, listening))
 
     def exited(self, name: str, code: int) -> None:
         """Put the end of a child process."""

@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from common.estimation.gaussian import Array, BoolArray, Gaussian
+from common.estimation.gaussian import Array, BoolArray
 from common.estimation.sprt import StatusArray
 
 IntArray = NDArray[np.int64]
@@ -73,11 +73,13 @@ class Join(NamedTuple):
         sensor: who joins.
         incarnation: random number of the process: a restarted node has lost its factors, a reconnected one has not.
         next_ns: no report of this sensor will be about an earlier time.
+        digest: of the scenario, which must be the center's.
     """
 
     sensor: str
     incarnation: int
     next_ns: int
+    digest: str
 
 
 class Start(NamedTuple):
@@ -102,16 +104,6 @@ class Start(NamedTuple):
     P: Array
     x_a: Array
     P_a: Array
-
-    @property
-    def factors(self) -> Gaussian:
-        """The factors."""
-        return Gaussian(self.x, self.P)
-
-    @property
-    def associations(self) -> Gaussian:
-        """The association filters."""
-        return Gaussian(self.x_a, self.P_a)
 
 
 class Stop(NamedTuple):

@@ -36,6 +36,9 @@ def speed_factor(_: object, tokens: Sequence[Token]) -> float:
     return value
 
 
+#: A switch for launchers, not for people.
+Hidden: TypeAlias = Annotated[bool, Parameter(show=False)]
+
 #: Seconds of measurement time per second, on the command line.
 Speed: TypeAlias = Annotated[float, Parameter(converter=speed_factor)]
 
@@ -100,7 +103,14 @@ def _until_closed(stop: Callable[[], None]) -> None:
 def main(app: App, tokens: list[str] | None = None) -> Any:
     """Run a command line; our own errors end with one clear message and exit code 1."""
     try:
-        return app(tokens)
+        result = app(tokens)
+        sys.stdout.flush()
+        return result
     except WaldnetError as error:
         print(error, file=sys.stderr)  # noqa: T201 (what a user is told)
-        sys.exit(1)
+    except BrokenPipeError:
+        # Whoever read our output has seen enough; nothing is left to say, not even at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except OSError as error:
+        print(f"{error.filename or 'waldnet'}: {error.strerror}", file=sys.stderr)  # noqa: T201
+    sys.exit(1)

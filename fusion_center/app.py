@@ -6,8 +6,9 @@ import json
 import time
 
 from common.config import load_scenario
+from common.inbox import Inbox
 from common.logs import LogFormat, configure
-from common.process import NetworkOptions, Speed, stopped_by_signals
+from common.process import Hidden, NetworkOptions, Speed, stopped_by_signals
 from common.transport import open_zenoh
 from fusion_center.center import Center
 from fusion_center.shell import CenterShell
@@ -21,7 +22,7 @@ def center(
     speed: Speed = 1.0,
     wait: float = 10.0,
     log: LogFormat = "auto",
-    with_parent: bool = False,
+    with_parent: Hidden = False,
 ) -> None:
     """Run the fusion center: order the reports, compute the likelihood ratio, decide, publish.
 
@@ -31,7 +32,7 @@ def center(
         scenario: scenario file, or name of one that comes along.
         options: the network.
         speed: seconds of measurement time per second, for sources without a clock; max: as fast as all go together.
-        wait: seconds to wait for all sensors; then the clock starts with those that are there.
+        wait: seconds to wait for the others once a sensor has joined; then the clock starts with those that are there.
         log: how to log to standard error; auto: colour on a terminal, JSON elsewhere.
         with_parent: end when standard input closes.
     """
@@ -39,8 +40,7 @@ def center(
     loaded = load_scenario(find(scenario))
     network = (options or NetworkOptions()).over(loaded)
     fusion = Center.of(loaded, speed=speed, wait_s=wait, first_epoch=time.time_ns())
-    with open_zenoh(network) as bus:
+    inbox = Inbox()
+    with stopped_by_signals(inbox.stop, with_parent=with_parent), open_zenoh(network) as bus:
         print(json.dumps({"listening": bus.endpoints()}), flush=True)  # noqa: T201 (for whoever started it)
-        shell = CenterShell(bus, network, loaded, fusion)
-        with stopped_by_signals(shell.stop, with_parent=with_parent):
-            shell.run()
+        CenterShell(bus, network, loaded, fusion, inbox=inbox).run()

@@ -100,7 +100,7 @@ class State(NamedTuple):
     """State of the center.
 
     Attributes:
-        opened_ns: wall time of the first event: the wait for sensors counts from here.
+        first_join_ns: wall time at which the wait for the other sensors began; None: nobody has joined.
         clock: once running.
         members: by number of the sensor.
         waiting: by measurement time.
@@ -110,7 +110,7 @@ class State(NamedTuple):
         counts: of reports.
     """
 
-    opened_ns: int
+    first_join_ns: int | None
     clock: Clock | None
     members: tuple[Member, ...]
     waiting: Mapping[int, Waiting]
@@ -146,8 +146,9 @@ class Center:
         hypotheses: the tracks given by the scenario, as a picture.
         epoch_ns: the instant of scenario time 0.
         speed: seconds of measurement time per second, 0: lockstep.
-        wait_ns: how long to wait for all sensors before the clock starts.
+        wait_ns: how long to wait for the others, once a sensor has joined, before the clock starts.
         first_epoch: later centers must use higher ones, so that nodes take over their tracks.
+        digest: of what node and center must have in common.
     """
 
     names: tuple[str, ...]
@@ -158,6 +159,7 @@ class Center:
     speed: float
     wait_ns: int
     first_epoch: int
+    digest: str
 
     @classmethod
     def of(cls, scenario: Scenario, *, speed: float = 0.0, wait_s: float = 10.0, first_epoch: int = 1) -> Center:
@@ -181,12 +183,13 @@ class Center:
             speed=speed,
             wait_ns=round(wait_s * NS_PER_S),
             first_epoch=first_epoch,
+            digest=scenario.digest,
         )
 
-    def initial(self, now_ns: int) -> State:
+    def initial(self) -> State:
         """A center that waits for its sensors."""
         return State(
-            opened_ns=now_ns,
+            first_join_ns=None,
             clock=None,
             members=tuple(Member() for _ in self.names),
             waiting={},
@@ -209,7 +212,7 @@ class Center:
         """
         messages: list[Message] = []
         match event:
-            case Join() if event.sensor in self.names:
+            case Join() if event.sensor in self.names and event.digest == self.digest:
                 state, messages = self._join(state, event)
             case Presence() if event.sensor in self.names:
                 number = self.names.index(event.sensor)
@@ -228,9 +231,7 @@ class Center:
     def deadline_ns(self, state: State) -> int | None:
         """Wall time at which a tick will change something; None: nothing is waited for."""
         if state.clock is None:
-            # Without anybody there the clock starts with the first to join.
-            joined = any(member.joined for member in state.members)
-            return state.opened_ns + self.wait_ns if joined else None
+            return None if state.first_join_ns is None else state.first_join_ns + self.wait_ns
         if not state.waiting or self.speed == 0.0:
             return None
         return state.waiting[min(state.waiting)].since_ns + self._hold_back_ns
@@ -253,7 +254,9 @@ class Center:
         member = Member(joined=True, alive=True, incarnation=join.incarnation, epoch=epoch, next_ns=join.next_ns)
         state = _with_member(state, number, member)
         answer: list[Message] = [self._start(state.picture, number, epoch)]
-        return state, [*answer, state.clock] if state.clock else answer
+        if state.clock is not None:
+            answer += [*self._advice(self.tracks(state)), state.clock]
+        return state, answer
 
     def _start(self, picture: Picture, number: int, epoch: int) -> Start:
         """The live tracks for one sensor: its last factor where it reported one, else the prior.
@@ -295,13 +298,13 @@ class Center:
         if clock is None or clock.speed == 0.0:
             return False
         present_ns = clock.time_ns + round((now_ns - clock.wall_ns) * clock.speed)
-        return time_ns > present_ns + self._window_ns
+        return time_ns > present_ns + self._window_ns + NS_PER_S
 
     def _accept(self, state: State, report: Report, now_ns: int) -> tuple[State, list[Message]]:
         number = self.names.index(report.sensor)
         member = state.members[number]
-        # A report shows that its sensor is there, whatever became of its token.
-        state = _with_member(state, number, member._replace(alive=True, next_ns=max(member.next_ns, report.next_ns)))
+        # It does not show that its sensor is there: the end of a token may overtake the last reports.
+        state = _with_member(state, number, member._replace(next_ns=max(member.next_ns, report.next_ns)))
         if report.time_ns <= state.time_ns:
             return self._late(state, number, report)
         waiting = state.waiting.get(report.time_ns, Waiting({}, now_ns))
@@ -322,10 +325,12 @@ class Center:
         groups[report.time_ns] = {**group, number: report}
         before = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
         state = _count(state._replace(history=state.history[:at]), "late")
+        pictures: list[Message] = []
         for time_ns in sorted(groups):
             state = self._work_in(state, time_ns, groups[time_ns])
+            pictures += self._publish(state)
         after = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
-        return state, [*_corrections(before, after), *self._publish(state)]
+        return state, [*_corrections(before, after), *pictures]
 
     def _work_in(self, state: State, time_ns: int, reports: Mapping[int, Report]) -> State:
         picture, decisions = self.fuser.advance(state.picture, time_ns, reports)
@@ -334,9 +339,11 @@ class Center:
     def _begin(self, state: State, now_ns: int) -> tuple[State, list[Message]]:
         """Start the clock once all sensors are there, or after the wait with those that are."""
         joined = [member for member in state.members if member.joined]
-        waited = now_ns - state.opened_ns >= self.wait_ns
-        if state.clock is not None or not joined or (len(joined) < len(self.names) and not waited):
+        if state.clock is not None or not joined:
             return state, []
+        since_ns = now_ns if state.first_join_ns is None else state.first_join_ns
+        if len(joined) < len(self.names) and now_ns - since_ns < self.wait_ns:
+            return state._replace(first_join_ns=since_ns), []
         first_ns = min(member.next_ns for member in joined)
         start_ns = self.epoch_ns if first_ns == NEVER else first_ns
         clock = Clock(time_ns=start_ns, wall_ns=now_ns + _LEAD_NS, speed=self.speed, clear_ns=start_ns)
@@ -383,7 +390,7 @@ class Center:
         if all(next_ns == NEVER for next_ns in nexts) and any(member.next_ns == NEVER for member in joined):
             clear_ns = NEVER
         elif self.speed == 0.0 and nexts:
-            time_ns, clear_ns = max(time_ns, state.time_ns), min(nexts)
+            time_ns, clear_ns = max(time_ns, state.time_ns), max(clear_ns, min(nexts))
         if clear_ns == state.clock.clear_ns:
             return state, []
         clock = state.clock._replace(time_ns=time_ns, clear_ns=clear_ns)
@@ -392,10 +399,13 @@ class Center:
     def _publish(self, state: State) -> list[Message]:
         """The newest picture, and advice where it is wanted."""
         tracks = self.tracks(state)
+        return [tracks, *self._advice(tracks)]
+
+    def _advice(self, tracks: Tracks) -> list[Message]:
         if self.fusion.feedback == "none":
-            return [tracks]
+            return []
         live = tracks.status != Status.DELETED
-        return [tracks, Advice(tracks.time_ns, tracks.ids[live], tracks.x[live], tracks.P[live])]
+        return [Advice(tracks.time_ns, tracks.ids[live], tracks.x[live], tracks.P[live])]
 
     def tracks(self, state: State) -> Tracks:
         """The newest picture as a message: all tracks that have started."""
@@ -437,11 +447,6 @@ def _count(state: State, what: str) -> State:
 
 
 def _corrections(before: list[Decision], after: list[Decision]) -> list[Message]:
-    """Decisions that a late report brought or undid."""
-
-    def name(decision: Decision) -> tuple[str, int, int]:
-        return decision.kind, decision.track, decision.time_ns
-
-    now, then = {name(decision) for decision in after}, {name(decision) for decision in before}
-    withdrawn = [decision._replace(kind="withdrawn") for decision in before if name(decision) not in now]
-    return [*withdrawn, *(decision for decision in after if name(decision) not in then)]
+    """Decisions that a late report brought, undid, or changed in their numbers."""
+    withdrawn = [decision._replace(kind="withdrawn") for decision in before if decision not in after]
+    return [*withdrawn, *(decision for decision in after if decision not in before)]

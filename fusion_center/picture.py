@@ -10,8 +10,9 @@ import numpy as np
 
 from common.config import NS_PER_S, Scenario
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, product
+from common.estimation.gaussian import Array, BoolArray, Gaussian, product
 from common.estimation.motion import Motion
+from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import Status, StatusArray, Thresholds, decide
@@ -180,13 +181,14 @@ class Fuser:
         after = product(Gaussian(said.x, said.P)) if said.who.any() else before
         # Cumulative sums that are both -inf have not changed.
         same = said.log_p_bar == picture.log_p_bar
-        evidence = np.where(same, 0.0, said.log_p_bar - np.where(same, 0.0, picture.log_p_bar)).sum(axis=-1)
-        log_lambda = _where_reported(said.who, after, before) + evidence
+        evidence = np.where(same, 0.0, said.log_p_bar - np.where(same, 0.0, picture.log_p_bar))
+        # A track that nobody reported stays as it is, to the last digit.
+        step = np.where(said.who.any(axis=-1), log_lambda(before, after, evidence), 0.0)
         return picture._replace(
             times_ns=np.full_like(picture.times_ns, t_ns),
             scans=picture.scans + said.who.any(axis=-1),
-            log_lr=picture.log_lr + log_lambda,
-            log_lr_total=picture.log_lr_total + log_lambda,
+            log_lr=picture.log_lr + step,
+            log_lr_total=picture.log_lr_total + step,
             log_p_bar=said.log_p_bar,
             reported=picture.reported | said.who,
             contributing=said.who,
@@ -247,8 +249,3 @@ def _collect(picture: Picture, predicted: Gaussian, reports: Mapping[int, Report
         said.x[rows, number] = report.x[theirs]
         said.P[rows, number] = report.P[theirs]
     return said
-
-
-def _where_reported(who: BoolArray, after: Product, before: Product) -> Array:
-    """``log c_after - log c_before``; exactly 0 for tracks nobody reported."""
-    return np.where(who.any(axis=-1), after.log_c - before.log_c, 0.0)

@@ -22,7 +22,9 @@ _LINGER_NS = 2_000_000_000
 class CenterShell:
     """The fusion center on a bus; ``run`` blocks, ``stop`` may be called from anywhere, a signal handler too."""
 
-    def __init__(self, bus: Bus, network: Network, scenario: Scenario, center: Center) -> None:
+    def __init__(
+        self, bus: Bus, network: Network, scenario: Scenario, center: Center, *, inbox: Inbox | None = None
+    ) -> None:
         """Take part in a network.
 
         Args:
@@ -30,13 +32,14 @@ class CenterShell:
             network: for its name.
             scenario: for times in logs.
             center: the pure step.
+            inbox: where somebody may have asked to stop already.
         """
         self._bus, self._scenario, self._center = bus, scenario, center
         self._log: structlog.typing.FilteringBoundLogger = structlog.get_logger().bind(center=scenario.name)
         self.complaints = Complaints(self._log)
-        self._inbox = Inbox()
+        self._inbox = inbox or Inbox()
         self._keys = Keys(network.name)
-        self._state = center.initial(time.time_ns())
+        self._state = center.initial()
         self._publishers: dict[str, Publisher] = {}
         self._picture: Tracks = center.tracks(self._state)
         self._stopped = False
@@ -99,14 +102,16 @@ class CenterShell:
         self._state, messages = self._center.step(before, event, time.time_ns())
         for message in messages:
             self._publish(message)
-        if isinstance(event, Join):
+        if isinstance(event, Join) and self._state.counts.refused == before.counts.refused:
             self._log.info("sensor joined", sensor=event.sensor, next_s=self._seconds(event.next_ns))
         if self._state.clock is not None and before.clock is None:
             absent = [n for n, m in zip(self._center.names, self._state.members, strict=True) if not m.joined]
             self._log.info("clock started", speed=self._center.speed or "lockstep", without=absent)
         for kind, old, new in zip(before.counts._fields, before.counts, self._state.counts, strict=True):
             if new > old:
-                self.complaints.add(f"{kind} report", repr(_summary(event)), new - old)
+                self.complaints.add(
+                    f"{kind} message" if isinstance(event, Join) else f"{kind} report", _summary(event), new - old
+                )
 
     def _say_presence(self, name: str, alive: bool) -> None:
         if name not in self._center.names:
@@ -136,6 +141,6 @@ def _summary(event: Event) -> str:
         case Report():
             return f"{event.sensor} at {event.time_ns} ns, epoch {event.epoch}, {len(event.ids)} tracks"
         case Join():
-            return f"{event.sensor} asks to join"
+            return f"{event.sensor} asks to join with the scenario of digest {event.digest}; the center's is another"
         case _:
             return type(event).__name__

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-import select
 import signal
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from common.errors import WaldnetError
+from common.inbox import Inbox
 
 #: How long a child may take to end after SIGTERM before it is killed.
 _GRACE_S = 5.0
-#: How long the center may take to listen.
-_READY_S = 30.0
 
 
 class LaunchError(WaldnetError):
@@ -31,14 +29,14 @@ class Children:
     killed, nothing stays behind.
     """
 
-    def __init__(self, logs: Path, exited: Callable[[str, int], None]) -> None:
+    def __init__(self, logs: Path, inbox: Inbox) -> None:
         """Keep track of children.
 
         Args:
             logs: folder of the log files.
-            exited: called on a thread of its own with name and exit code whenever a child ends.
+            inbox: told where a child listens, once it does, and of every end.
         """
-        self._logs, self._exited = logs, exited
+        self._logs, self._inbox = logs, inbox
         self._children: dict[str, subprocess.Popen[str]] = {}
         logs.mkdir(parents=True, exist_ok=True)
 
@@ -46,7 +44,8 @@ class Children:
         """Start ``python -m module``; its messages go to NAME.log."""
         with self._log(name).open("w") as log:
             child = subprocess.Popen(
-                [sys.executable, "-m", module, *arguments, "--log", "json", "--with-parent"],
+                # -P: a folder of the user's that is named like one of ours must not take its place.
+                [sys.executable, "-P", "-m", module, *arguments, "--log", "json", "--with-parent"],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=log,
@@ -54,31 +53,12 @@ class Children:
                 start_new_session=True,  # Ctrl-C is for the launcher, which ends the children in order.
             )
         self._children[name] = child
-        threading.Thread(target=self._wait, args=(name, child), daemon=True).start()
-
-    def first_line(self, name: str) -> dict[str, list[str]]:
-        """What a child says of itself once it is ready.
-
-        Raises:
-            LaunchError: it ended instead, or said nothing in time.
-        """
-        output = self._children[name].stdout
-        assert output is not None
-        ready, _, _ = select.select([output], [], [], _READY_S)
-        line = output.readline() if ready else ""
-        if not line:
-            raise LaunchError(f"{name} did not start: {self.last_words(name)}")
-        said: dict[str, list[str]] = json.loads(line)
-        return said
+        threading.Thread(target=self._attend, args=(name, child), daemon=True).start()
 
     def last_words(self, name: str) -> str:
         """The end of a child's log."""
         lines = self._log(name).read_text(errors="replace").strip().splitlines()
         return lines[-1] if lines else "it said nothing"
-
-    def pid(self, name: str) -> int:
-        """Process id of a child."""
-        return self._children[name].pid
 
     def running(self) -> list[str]:
         """Names of the children that have not ended."""
@@ -93,9 +73,8 @@ class Children:
             self._children[name].kill()
         self.join(_GRACE_S)
         for child in self._children.values():
-            for pipe in (child.stdin, child.stdout):
-                if pipe is not None:
-                    pipe.close()
+            if child.stdin is not None:
+                child.stdin.close()
 
     def join(self, seconds: float) -> None:
         """Wait until all children have ended, or for ``seconds``."""
@@ -106,8 +85,14 @@ class Children:
             except subprocess.TimeoutExpired:
                 return
 
-    def _wait(self, name: str, child: subprocess.Popen[str]) -> None:
-        self._exited(name, child.wait())
+    def _attend(self, name: str, child: subprocess.Popen[str]) -> None:
+        """Read what a child says, to the end, and wait for it."""
+        assert child.stdout is not None
+        with child.stdout as output:
+            for line in output:
+                if line.startswith('{"listening"'):
+                    self._inbox.said(name, tuple(json.loads(line)["listening"]))
+        self._inbox.exited(name, child.wait())
 
     def _log(self, name: str) -> Path:
         return self._logs / f"{name}.log"

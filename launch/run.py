@@ -12,7 +12,7 @@ from common.codec import decode
 from common.config import Network, Scenario
 from common.errors import DecodeError
 from common.estimation.sprt import Status
-from common.inbox import Exited, Heard, Inbox, Incoming, Present, Stopped
+from common.inbox import Exited, Heard, Inbox, Incoming, Present, Said, Stopped
 from common.messages import NEVER, Clock, Decision, Keys, Tracks, sensor_of
 from common.process import stopped_by_signals
 from common.transport import Bus, open_zenoh
@@ -57,8 +57,10 @@ class Run:
         self._inbox = Inbox()
         self.record = Record(order.scenario)
         self._status = LiveStatus(self.record, order.end_ns, console)
-        self._children = Children(order.out / "logs", self._inbox.exited)
+        self._children = Children(order.out / "logs", self._inbox)
         self._keys = Keys(order.scenario.network.name)
+        self._shared: list[str] = []
+        self._running: set[str] = set()
         self._finished = self._stopped = False
 
     def run(self) -> None:
@@ -70,10 +72,10 @@ class Run:
         listen = Network(name=self._keys.network, listen=("tcp/127.0.0.1:0",))
         with stopped_by_signals(self._inbox.stop), open_zenoh(listen) as bus:
             try:
-                self._start_all(bus)
                 self._watch(bus)
                 with self._status:
                     self._greet()
+                    self._start_center(bus.endpoints())
                     self._follow()
                     self._follow_up(bus)
             finally:
@@ -86,30 +88,37 @@ class Run:
             f"{len(scenario.hypotheses)} hypotheses to decide on"
         )
 
-    def _start_all(self, bus: Bus) -> None:
-        order, here = self._order, bus.endpoints()
-        same = ["--network-name", self._keys.network]
-        speed = str(order.speed) if order.speed else "max"
-        to_here = [word for endpoint in here for word in ("--connect", endpoint)]
-        listening = ["--listen", "tcp/127.0.0.1:0", "--mode", "peer"]
-        self._children.start(CENTER, "fusion_center", [str(order.path), *same, *to_here, *listening, "--speed", speed])
-        at = [word for endpoint in self._children.first_line(CENTER)["listening"] for word in ("--connect", endpoint)]
-        source = ["--seed", str(order.seed), *(["--plots", str(order.plots)] if order.plots else [])]
-        for name in order.scenario.sensor_names:
-            connect = [*at, *to_here, "--mode", "peer"]
-            self._children.start(name, "sensor_node", [str(order.path), name, *same, *connect, *source])
-
     def _watch(self, bus: Bus) -> None:
         for key in (self._keys.tracks(), self._keys.decision(), self._keys.clock()):
             bus.subscribe(key, self._inbox.heard, history=200)
         bus.subscribe(self._keys.plots(), self._inbox.heard, reliable=False)
         bus.watch(self._keys.sensor_alive(), self._inbox.present)
 
+    def _start_center(self, here: tuple[str, ...]) -> None:
+        # Children take the network's name and nothing else of it from the scenario: all are on this machine.
+        file = self._order.out / "logs" / "network.toml"
+        file.write_text(f'name = "{self._keys.network}"\n')
+        self._shared = ["--network", str(file), *_options("--connect", here)]
+        speed = str(self._order.speed) if self._order.speed else "max"
+        listen = ["--listen", "tcp/127.0.0.1:0"]
+        self._start(CENTER, "fusion_center", [str(self._order.path), *self._shared, *listen, "--speed", speed])
+
+    def _start_sensors(self, center: tuple[str, ...]) -> None:
+        order = self._order
+        source = ["--seed", str(order.seed), *(["--plots", str(order.plots)] if order.plots else [])]
+        for name in order.scenario.sensor_names:
+            arguments = [str(order.path), name, *self._shared, *_options("--connect", center), *source]
+            self._start(name, "sensor_node", arguments)
+
+    def _start(self, name: str, module: str, arguments: list[str]) -> None:
+        self._children.start(name, module, arguments)
+        self._running.add(name)
+
     def _follow(self) -> None:
         """Until all children have ended by themselves, or must be ended."""
         until_ns: int | None = None
         while not self._stopped:
-            if until_ns is None and not self._children.running():
+            if until_ns is None and not self._running:
                 until_ns = time.time_ns() + _LAST_WORDS_NS
             if until_ns is not None and (self._finished or time.time_ns() >= until_ns):
                 return
@@ -127,7 +136,10 @@ class Run:
                 self._hear(key, payload)
             case Present(key, alive):
                 self._status.present(sensor_of(key), alive)
+            case Said(name, listening) if name == CENTER:
+                self._start_sensors(listening)
             case Exited(name, code):
+                self._running.discard(name)
                 self._child_ended(name, code)
             case Stopped():
                 self._stopped = True
@@ -163,6 +175,10 @@ class Run:
             self._status.say(f"sensor {name} died ({why}); the run goes on with the others", "bold red")
             if set(self.record.lost) == set(self._order.scenario.sensor_names):
                 raise LaunchError("all sensors died; the logs in the report folder say why")
+
+
+def _options(option: str, values: tuple[str, ...]) -> list[str]:
+    return [word for value in values for word in (option, value)]
 
 
 def execute(order: Order, console: Console) -> None:

@@ -53,7 +53,7 @@ class LiveStatus:
 
     def say(self, text: str, style: str = "") -> None:
         """Print one line, above the table."""
-        self._console.print(Text(text, style=style))
+        self._console.print(Text(text, style=style), soft_wrap=True)
 
     def decided(self, decision: Decision) -> None:
         """Say what was decided."""
@@ -72,6 +72,9 @@ class LiveStatus:
     def picture(self, tracks: Tracks) -> None:
         """Note the newest picture."""
         self._last = tracks
+        for row, track in enumerate(tracks.ids):
+            entry = (Status(tracks.status[row]), float(tracks.log_lr[row]), float(tracks.log_lr_total[row]))
+            self._seen[int(track)] = entry
 
     def _render(self) -> Group:
         limits = self._record.scenario.decision.thresholds
@@ -81,20 +84,12 @@ class LiveStatus:
         table.add_column("log LR", justify="right")
         table.add_column(f"log A = {limits.log_a:.1f}{'0':^{2 * _BAR - 22}}log B = {limits.log_b:.1f}")
         table.add_column("total", justify="right")
-        rows = self._rows()
+        rows = sorted(self._seen.items())
         for track, (status, log_lr, total) in rows[:_ROWS]:
             bar = _bar(log_lr, limits.log_a, limits.log_b)
             table.add_row(str(track), Text(status.name.lower(), _STYLE[status]), f"{log_lr:+.2f}", bar, f"{total:+.1f}")
         more = [Text(f"... and {len(rows) - _ROWS} more tracks")] if len(rows) > _ROWS else []
         return Group(table, *more, self._sensors(), self._progress())
-
-    def _rows(self) -> list[tuple[int, tuple[Status, float, float]]]:
-        if self._last is None:
-            return []
-        for row, track in enumerate(self._last.ids):
-            entry = (Status(self._last.status[row]), float(self._last.log_lr[row]), float(self._last.log_lr_total[row]))
-            self._seen[int(track)] = entry
-        return sorted(self._seen.items())
 
     def _sensors(self) -> Text:
         text = Text("sensors ")

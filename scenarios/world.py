@@ -38,7 +38,7 @@ def scan_times_ns(scenario: Scenario, sensor: SensorConfig) -> IntArray:
     if scenario.simulation is None:
         raise ConfigError(f"{scenario.name}: has no [simulation]; give recorded plots, or a duration to simulate")
     first = sensor.scan_interval if sensor.first_scan is None else sensor.first_scan
-    # Half a nanosecond of slack: the last scan may fall on the end.
+    # A little slack: the last scan may fall on the end.
     count = int(np.floor((scenario.simulation.duration - first) / sensor.scan_interval + 1e-9)) + 1
     return np.array([scenario.to_ns(first + k * sensor.scan_interval) for k in range(max(count, 0))], np.int64)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from common.config import load_scenario
+from common.inbox import Inbox
 from common.logs import LogFormat, configure
-from common.process import NetworkOptions, stopped_by_signals
+from common.process import Hidden, NetworkOptions, stopped_by_signals
 from common.transport import open_zenoh
 from scenarios.catalogue import find
 from sensor_node.shell import NodeShell
@@ -23,7 +24,7 @@ def node(
     seed: int | None = None,
     patience: float = 30.0,
     log: LogFormat = "auto",
-    with_parent: bool = False,
+    with_parent: Hidden = False,
 ) -> None:
     """Run one sensor: filter its scans and report to the fusion center.
 
@@ -33,16 +34,15 @@ def node(
         options: the network.
         plots: recorded plots (JSON Lines) instead of the scenario's.
         seed: of the simulated world, instead of the scenario's.
-        patience: seconds to wait for a center before giving up.
+        patience: seconds to wait for the first answer of a center before giving up.
         log: how to log to standard error; auto: colour on a terminal, JSON elsewhere.
         with_parent: end when standard input closes.
     """
     configure(log)
     loaded = load_scenario(find(scenario))
+    inbox = Inbox()
     seen = source(loaded, loaded.sensor(sensor).name, plots=plots, seed=seed)
     tracker = LocalTracker.of(loaded, sensor, seen.schedule)
     network = (options or NetworkOptions()).over(loaded)
-    with open_zenoh(network) as bus:
-        shell = NodeShell(bus, network, tracker, seen.scans, patience_s=patience)
-        with stopped_by_signals(shell.stop, with_parent=with_parent):
-            shell.run()
+    with stopped_by_signals(inbox.stop, with_parent=with_parent), open_zenoh(network) as bus:
+        NodeShell(bus, network, tracker, seen.scans, inbox=inbox, patience_s=patience).run()

@@ -11,7 +11,7 @@ import structlog
 
 from common.codec import decode, encode
 from common.config import Network
-from common.errors import DecodeError, TransportError, VersionError
+from common.errors import ConfigError, DecodeError, TransportError, VersionError
 from common.inbox import Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Scan, Start, Stop
@@ -20,13 +20,22 @@ from sensor_node.tracker import LocalTracker
 
 #: Between two requests to join while no center answers.
 _JOIN_EVERY_NS = 1_000_000_000
+#: With all scans sent, how long a center that is gone may take to come back for the last reports.
+_FAREWELL_NS = 5_000_000_000
 
 
 class NodeShell:
     """One sensor node on a bus; ``run`` blocks, ``stop`` may be called from anywhere, a signal handler too."""
 
     def __init__(
-        self, bus: Bus, network: Network, tracker: LocalTracker, scans: Sequence[Scan], *, patience_s: float = 30.0
+        self,
+        bus: Bus,
+        network: Network,
+        tracker: LocalTracker,
+        scans: Sequence[Scan],
+        *,
+        inbox: Inbox | None = None,
+        patience_s: float = 30.0,
     ) -> None:
         """Take part in a network.
 
@@ -35,22 +44,24 @@ class NodeShell:
             network: for its name, and for errors.
             tracker: the pure steps.
             scans: what the sensor will see, by time.
-            patience_s: how long to wait for a center that was never heard of.
+            inbox: where somebody may have asked to stop already.
+            patience_s: how long to wait for the first answer of a center.
         """
         self._bus, self._network, self._tracker, self._scans = bus, network, tracker, scans
         self._patience_ns = round(patience_s * 1e9)
         self._name = tracker.config.name
         self._log: structlog.typing.FilteringBoundLogger = structlog.get_logger().bind(sensor=self._name)
         self.complaints = Complaints(self._log)
-        self._inbox = Inbox()
+        self._inbox = inbox or Inbox()
         self._incarnation = secrets.randbits(62)
         self._state = tracker.initial()
         self._position = 0
         self._clock: Clock | None = None
         self._advised_ns: int | None = None
-        self._center = False
+        self._center = self._new_center = False
         self._answered = self._stopped = False
-        self._began_ns = self._joined_ns = 0
+        self._began_ns = self._joined_ns = self._ask_ns = 0
+        self._gone_ns: int | None = None
         self._keys = Keys(network.name)
         self._publishers: dict[str, Publisher] = {}
 
@@ -64,6 +75,7 @@ class NodeShell:
         Raises:
             TransportError: no center answered within the patience.
             VersionError: the center speaks another wire version.
+            ConfigError: the center runs another scenario.
         """
         self._open()
         while not self._stopped and not self._done():
@@ -72,7 +84,7 @@ class NodeShell:
             if self._inbox.empty and due is not None and due <= now:
                 self._process(self._scans[self._position])
                 continue
-            self._handle(self._inbox.receive(self._wake_ns(due, now)))
+            self._handle(self._inbox.receive(self._wake_ns(due)))
         self._log.info("ended", scans=self._position, of=len(self._scans), dropped=dict(self.complaints.counts))
 
     def _open(self) -> None:
@@ -87,12 +99,14 @@ class NodeShell:
         self._bus.answer(self._keys.about(self._name), lambda: about)
         self._bus.announce(self._keys.sensor_alive(self._name))
         self._bus.watch(self._keys.center_alive(), self._inbox.present)
-        self._began_ns = time.time_ns()
+        self._began_ns = self._ask_ns = time.time_ns()
 
-    def _wake_ns(self, due_ns: int | None, now_ns: int) -> int | None:
+    def _wake_ns(self, due_ns: int | None) -> int | None:
         """When to look up from the inbox; None: not before something comes in."""
         if not self._answered:
-            return now_ns + _JOIN_EVERY_NS
+            return self._ask_ns
+        if self._exhausted and self._gone_ns is not None:
+            return self._gone_ns + _FAREWELL_NS
         return due_ns
 
     def _handle(self, incoming: Incoming) -> None:
@@ -102,7 +116,9 @@ class NodeShell:
             case Present(_, alive):
                 self._center_changed(alive)
             case Missed(key, number):
+                # What the center said last comes with its answer.
                 self.complaints.add("lost messages", key, number)
+                self._join()
             case Stopped():
                 self._stopped = True
             case _:
@@ -111,21 +127,24 @@ class NodeShell:
     def _center_changed(self, alive: bool) -> None:
         if self._center and not alive:
             self._log.warning("the center is gone; waiting for it to come back")
-        self._center = alive
+        self._center, self._gone_ns = alive, None if alive else time.time_ns()
         if alive:
+            self._new_center = True
             self._join()
 
     def _ask_again(self) -> None:
         """While no center has answered: ask again, and give up in the end."""
-        if self._answered:
+        now = time.time_ns()
+        if self._answered or now < self._ask_ns:
             return
-        waited = time.time_ns() - self._began_ns
+        self._ask_ns = now + _JOIN_EVERY_NS
+        waited = now - self._began_ns
         if waited > self._patience_ns:
             where = ", ".join((*self._network.connect, *self._network.listen)) or "no endpoint"
             raise TransportError(
                 f"no center of network {self._network.name!r} answered {self._name!r} within {waited / 1e9:.0f} s "
-                f"({self._network.mode} at {where}): is it running, does its scenario have this sensor, and is the "
-                "network's name the same?"
+                f"({self._network.mode} at {where}): is it running, with the same scenario, and is the network's "
+                "name the same?"
             )
         if self._center:
             self._join()
@@ -133,7 +152,7 @@ class NodeShell:
     def _join(self) -> None:
         if self._clock is None:
             self._joined_ns = time.time_ns()
-        self._publish(Join(self._name, self._incarnation, self._next_ns()))
+        self._publish(Join(self._name, self._incarnation, self._next_ns(), self._tracker.digest))
 
     def _next_ns(self) -> int:
         return self._scans[self._position].time_ns if self._position < len(self._scans) else NEVER
@@ -141,12 +160,17 @@ class NodeShell:
     def _hear(self, key: str, payload: bytes) -> None:
         try:
             message = decode(key, payload)
-        except VersionError as error:
-            raise VersionError(f"the center of this network and this node do not fit together: {error}") from None
         except DecodeError as error:
+            if isinstance(error, VersionError) and not self._answered:
+                raise VersionError(f"the center of this network and this node do not fit together: {error}") from None
             self.complaints.add("bad bytes", str(error))
             return
         match message:
+            case Start() | Advice() if message.x.shape[-1] != self._tracker.motion.n:
+                raise ConfigError(
+                    f"{key}: states of {message.x.shape[-1]} numbers, this node's have {self._tracker.motion.n}: "
+                    "do center and node run the same scenario?"
+                )
             case Start():
                 self._answered = True
                 self._state = self._tracker.start(self._state, message)
@@ -164,14 +188,16 @@ class NodeShell:
     def _set_clock(self, clock: Clock) -> None:
         first = self._clock is None
         self._clock = clock
+        if self._tracker.advised and self._new_center:
+            self._advised_ns = clock.time_ns
+        self._new_center = False
         if not first:
             return
-        if self._tracker.advised:
-            self._advised_ns = clock.time_ns
         present_ns = clock.clear_ns
         if clock.speed > 0.0:
             # Whoever asked before the clock began sees everything; whoever comes later begins with the present.
-            late_ns = time.time_ns() - clock.wall_ns if self._joined_ns > clock.wall_ns else 0
+            late = not 0 < self._joined_ns <= clock.wall_ns
+            late_ns = time.time_ns() - clock.wall_ns if late else 0
             present_ns = clock.time_ns + round(late_ns * clock.speed)
         while self._position < len(self._scans) and self._scans[self._position].time_ns < present_ns:
             self._position += 1
@@ -199,9 +225,14 @@ class NodeShell:
 
     def _done(self) -> bool:
         """All scans are sent, and the center has them all or is no more."""
-        if self._position < len(self._scans) or self._clock is None:
+        if not self._exhausted or self._clock is None:
             return False
-        return self._clock.clear_ns == NEVER or not self._center
+        farewell = self._gone_ns is not None and time.time_ns() >= self._gone_ns + _FAREWELL_NS
+        return self._clock.clear_ns == NEVER or farewell
+
+    @property
+    def _exhausted(self) -> bool:
+        return self._position == len(self._scans)
 
     def _publish(self, message: Message) -> None:
         self._publishers[self._keys.of(message)].put(encode(message))

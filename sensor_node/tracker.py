@@ -94,6 +94,7 @@ class LocalTracker:
         share: its share of prior and process noise.
         tight: associate with a filter of its own (theory.md §5).
         advised: the fused track comes back as advice (theory.md §6).
+        digest: of what the center must have in common with this node.
         gate_probability: that the target's plot is inside the gate.
         buffer_ns: how long scans are kept.
         schedule: scan times of the network, only for ``dkf``.
@@ -107,6 +108,7 @@ class LocalTracker:
     share: Share
     tight: bool
     advised: bool
+    digest: str
     gate_probability: float
     buffer_ns: int
     schedule: Schedule | None
@@ -134,6 +136,7 @@ class LocalTracker:
             share=scenario.share,
             tight=scenario.fusion.association == "tight",
             advised=scenario.fusion.feedback == "advice",
+            digest=scenario.digest,
             gate_probability=scenario.fusion.gate_probability,
             buffer_ns=round(scenario.fusion.window * NS_PER_S),
             schedule=schedule if scenario.fusion.mode == "dkf" else None,
@@ -197,7 +200,7 @@ class LocalTracker:
         past = [advice for advice in state.advice if advice.time_ns < t_ns]
         if not past:
             return state
-        advice = max(past, key=lambda advice: advice.time_ns)
+        advice = sorted(past, key=lambda advice: advice.time_ns)[-1]  # of one time the one that came last
         state = state._replace(advice=tuple(later for later in state.advice if later.time_ns >= t_ns))
         tracks = state.tracks
         _, mine, given = np.intersect1d(tracks.ids, advice.ids, assume_unique=True, return_indices=True)

@@ -99,10 +99,10 @@ def draw_plan(record: Record, path: Path) -> None:
 
 def _with_resets(record: Record, track: int, history: History) -> tuple[Array, Array]:
     """Times and log LR with the value that each reset, at a confirmation, threw away."""
-    step = np.diff(history.log_lr_total, prepend=0.0)
     before = np.concatenate([[0.0], history.log_lr[:-1]])
     start_s = record.scenario.hypotheses[track].start if track < len(record.scenario.hypotheses) else history.times_s[0]
     with np.errstate(invalid="ignore"):
+        step = np.diff(history.log_lr_total, prepend=0.0)
         reached = np.nan_to_num(before + step, nan=-1e3, neginf=-1e3)
     times = np.concatenate([[start_s], np.repeat(history.times_s, 2)])
     values = np.stack([reached, np.maximum(history.log_lr, -1e3)], axis=-1).ravel()

@@ -42,7 +42,7 @@ class Record:
 
     Attributes:
         scenario: what ran.
-        pictures: of every measurement time; a late report replaces the ones it changes from its center on.
+        pictures: of every measurement time; a late report replaces those from its time on.
         decisions: in the order they were made.
         scans: the plots as the sensors published them.
         lost: why sensors went before their end, by name.

@@ -25,7 +25,7 @@ class Replay:
         schedule = schedule_of(scans, scenario)
         self._scans = scans
         self._center = Center.of(scenario, speed=0.0)
-        self._state = self._center.initial(0)
+        self._state = self._center.initial()
         self._trackers = {name: LocalTracker.of(scenario, name, schedule) for name in scenario.sensor_names}
         self._nodes: dict[str, NodeState] = {name: tracker.initial() for name, tracker in self._trackers.items()}
         self._next = _next_times(scans, scenario.sensor_names)
@@ -33,7 +33,7 @@ class Replay:
     def run(self) -> Iterator[Tracks | Decision]:
         """Feed all scans; yields the picture after every measurement time, and the decisions before it."""
         for incarnation, (name, times) in enumerate(self._next.items()):
-            yield from self._tell_center(Join(name, incarnation, next(times)))
+            yield from self._tell_center(Join(name, incarnation, next(times), self._center.digest))
         for scan in self._scans:
             name = scan.sensor
             self._nodes[name], report = self._trackers[name].scan(self._nodes[name], scan, next(self._next[name]))

@@ -81,7 +81,7 @@ class Stage:
     def __init__(self, plot: Scenario, **options: Any) -> None:
         self.scenario = plot
         self.center = Center.of(plot, **options)
-        self.state: CenterState = self.center.initial(0)
+        self.state: CenterState = self.center.initial()
         self.said: list[Message] = []
 
     def tell(self, event: Event, at_s: float = 0.0) -> list[Message]:
@@ -96,7 +96,7 @@ class Stage:
 
     def join(self, name: str, next_s: float | None, incarnation: int = 1, at_s: float = 0.0) -> list[Message]:
         """A sensor joins; ``next_s`` None: it has nothing to report."""
-        return self.tell(Join(name, incarnation, self.ns(next_s)), at_s)
+        return self.tell(Join(name, incarnation, self.ns(next_s), self.center.digest), at_s)
 
     def join_all(self, **next_s: float) -> dict[str, Start]:
         """All sensors join, the next scan of each at 2 s unless given; the tracks each was told of."""

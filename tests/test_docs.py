@@ -68,7 +68,7 @@ def test_how_to_on_one_machine(folder: Path) -> None:
 
 
 def test_the_recorded_plots_of_the_how_to_are_valid(folder: Path) -> None:
-    (folder / "plots.jsonl").write_text(blocks(HOW_TO, "json")[0])
+    (folder / "plots.jsonl").write_text(blocks(HOW_TO, "json")[1])
     assert "2 scans, 2 plots" in run([WALDNET, "check", "harbour.toml", "plots.jsonl"], folder)
 
 

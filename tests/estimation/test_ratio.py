@@ -11,13 +11,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from common.estimation.gaussian import Gaussian
-from common.estimation.ratio import log_lambda
+from common.estimation import ratio
+from common.estimation.gaussian import Array, BoolArray, Gaussian, product
 
 Draw: TypeAlias = Callable[..., Gaussian]
 
 SHAPES = [(), (1,), (3, 1, 2)]
 SEEDS = st.integers(0, 2**32 - 1)
+
+
+def log_lambda(before: Gaussian, after: Gaussian, log_p_bar: Array, members: BoolArray | None = None) -> Array:
+    """From factors; evidence of members alone."""
+    evidence = log_p_bar if members is None else np.where(members, log_p_bar, 0.0)
+    return ratio.log_lambda(product(before, members), product(after, members), evidence)
 
 
 def log_c(factors: Gaussian) -> float:

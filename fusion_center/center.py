@@ -255,7 +255,8 @@ class Center:
         state = _with_member(state, number, member)
         answer: list[Message] = [self._start(state.picture, number, epoch)]
         if state.clock is not None:
-            answer += [*self._advice(self.tracks(state)), state.clock]
+            advice = self._advice(self.tracks(state)) if state.history else []
+            answer += [*advice, state.clock]
         return state, answer
 
     def _start(self, picture: Picture, number: int, epoch: int) -> Start:

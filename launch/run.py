@@ -96,7 +96,7 @@ class Run:
 
     def _start_center(self, here: tuple[str, ...]) -> None:
         # Children take the network's name and nothing else of it from the scenario: all are on this machine.
-        file = self._order.out / "logs" / "network.toml"
+        file = self._order.out / "network.toml"
         file.write_text(f'name = "{self._keys.network}"\n')
         self._shared = ["--network", str(file), *_options("--connect", here)]
         speed = str(self._order.speed) if self._order.speed else "max"

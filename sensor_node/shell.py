@@ -99,7 +99,8 @@ class NodeShell:
         self._bus.answer(self._keys.about(self._name), lambda: about)
         self._bus.announce(self._keys.sensor_alive(self._name))
         self._bus.watch(self._keys.center_alive(), self._inbox.present)
-        self._began_ns = self._ask_ns = time.time_ns()
+        self._began_ns = time.time_ns()
+        self._ask_ns = self._began_ns + _JOIN_EVERY_NS
 
     def _wake_ns(self, due_ns: int | None) -> int | None:
         """When to look up from the inbox; None: not before something comes in."""
@@ -179,7 +180,7 @@ class NodeShell:
                 self._state = self._tracker.stop(self._state, message)
             case Advice():
                 self._state = self._tracker.advise(self._state, message)
-                self._advised_ns = message.time_ns
+                self._advised_ns = max(message.time_ns, self._advised_ns or message.time_ns)
             case Clock():
                 self._set_clock(message)
             case _:

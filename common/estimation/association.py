@@ -20,6 +20,7 @@ from common.estimation.gaussian import (
     Gaussian,
     cholesky,
     half_log_det,
+    log_sum_exp,
     squared_norm,
     symmetric,
     times_transposed,
@@ -147,13 +148,11 @@ def normalise(log_p_star: Array) -> tuple[Array, Array]:
         p_j, shape (..., 1 + M), and log p_bar, shape (...). A scan that h1 holds for impossible (p_d = 1 and no plot in
         the gate) gives log p_bar = -inf and, as nothing can be learnt from it, p_0 = 1.
     """
-    top = log_p_star.max(axis=-1, keepdims=True)
-    possible = np.isfinite(top)
-    p = np.exp(log_p_star - np.where(possible, top, 0.0))
-    p[..., 0] += ~possible[..., 0]
-    total = p.sum(axis=-1, keepdims=True)
-    p /= total
-    return p, (top + np.log(total))[..., 0]
+    log_p_bar = log_sum_exp(log_p_star)
+    possible = np.isfinite(log_p_bar)
+    p = np.exp(log_p_star - np.where(possible, log_p_bar, 0.0)[..., None])
+    p[..., 0] += ~possible
+    return p, log_p_bar
 
 
 def absorb(predicted: Gaussian, innovations: Innovations, p: Array) -> Gaussian:

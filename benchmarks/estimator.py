@@ -138,9 +138,11 @@ def stone_soup_scan() -> Callable[[], object]:
 
 def measure() -> dict[str, Any]:
     """All figures."""
-    soup = microseconds(stone_soup_scan(), repetitions=7)
+    soup_scan = stone_soup_scan()
     rows = []
     for tracks in BATCHES:
+        # Just before, not once for all: the speed of a shared machine drifts.
+        soup = microseconds(soup_scan)
         factor = microseconds(waldnet_scan(tracks, tightly=False)) / tracks
         both = microseconds(waldnet_scan(tracks, tightly=True)) / tracks
         center = microseconds(center_scan(tracks)) / tracks

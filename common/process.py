@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
-from cyclopts import App, Parameter, Token
+from cyclopts import App, Parameter, Token, validators
 
 from common.config import Network, Scenario, load_network
 from common.errors import WaldnetError
@@ -35,6 +35,9 @@ def speed_factor(_: object, tokens: Sequence[Token]) -> float:
         raise ValueError(f"{text!r} is neither a positive factor nor max")
     return value
 
+
+#: Of a simulated world.
+Seed: TypeAlias = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 
 #: A switch for launchers, not for people.
 Hidden: TypeAlias = Annotated[bool, Parameter(show=False)]

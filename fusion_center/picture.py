@@ -243,9 +243,17 @@ def _collect(picture: Picture, predicted: Gaussian, reports: Mapping[int, Report
     """Lay the reports over the predicted factors; tracks that a report or the picture lacks are left alone."""
     said = Reported(np.zeros_like(picture.reported), picture.log_p_bar.copy(), predicted.x.copy(), predicted.P.copy())
     for number, report in reports.items():
-        _, rows, theirs = np.intersect1d(picture.ids, report.ids, assume_unique=True, return_indices=True)
+        rows, theirs = _common(picture.ids, report.ids)
         said.who[rows, number] = True
         said.log_p_bar[rows, number] = report.log_g[theirs]
         said.x[rows, number] = report.x[theirs]
         said.P[rows, number] = report.P[theirs]
     return said
+
+
+def _common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:
+    """Where ids that both have stand in each; mostly both have the same."""
+    if np.array_equal(ours, theirs):
+        return slice(None), slice(None)
+    _, rows, others = np.intersect1d(ours, theirs, assume_unique=True, return_indices=True)
+    return rows, others

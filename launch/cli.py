@@ -6,6 +6,7 @@ import json
 import sys
 from contextlib import nullcontext
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -15,13 +16,17 @@ from common.config import Network, Scenario, load_scenario
 from common.estimation.sprt import Status
 from common.logs import LogFormat, configure
 from common.messages import Tracks
-from common.process import Speed
+from common.process import Seed, Speed
 from common.process import main as run_app
 from fusion_center.app import center
 from scenarios.catalogue import find, names
 from sensor_node.app import node
 
-app = App(name="waldnet", help="Sensors decide together, by Wald's sequential test, which tracks are real.")
+app = App(
+    name="waldnet",
+    version=version("waldnet"),
+    help="Sensors decide together, by Wald's sequential test, which tracks are real.",
+)
 app.command(node)
 app.command(center)
 
@@ -31,7 +36,7 @@ def run(
     scenario: str,
     *,
     plots: Path | None = None,
-    seed: int | None = None,
+    seed: Seed | None = None,
     speed: Speed = 1.0,
     out: Path | None = None,
 ) -> None:
@@ -99,7 +104,7 @@ def replay(
 
 
 @app.command
-def simulate(scenario: str, *, seed: int | None = None, out: Path | None = None) -> None:
+def simulate(scenario: str, *, seed: Seed | None = None, out: Path | None = None) -> None:
     """Write the plots of a simulated world as JSON Lines: those that the processes of ``waldnet run`` will see.
 
     Args:

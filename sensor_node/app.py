@@ -7,7 +7,7 @@ from pathlib import Path
 from common.config import load_scenario
 from common.inbox import Inbox
 from common.logs import LogFormat, configure
-from common.process import Hidden, NetworkOptions, stopped_by_signals
+from common.process import Hidden, NetworkOptions, Seed, stopped_by_signals
 from common.transport import open_zenoh
 from scenarios.catalogue import find
 from sensor_node.shell import NodeShell
@@ -21,7 +21,7 @@ def node(
     *,
     options: NetworkOptions | None = None,
     plots: Path | None = None,
-    seed: int | None = None,
+    seed: Seed | None = None,
     patience: float = 30.0,
     log: LogFormat = "auto",
     with_parent: Hidden = False,

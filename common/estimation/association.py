@@ -107,8 +107,9 @@ def innovate(predicted: Gaussian, z: Array, sensor: Linearised) -> Innovations:
     n, m = PH.shape[-2:]
     right = np.empty((*PH.shape[:-2], 2 * n + m, m))
     right[..., :n, :], right[..., n : 2 * n, :], right[..., 2 * n :, :] = PH, sensor.H.mT, sensor.R
-    W, J, M = np.split(whiten(L_plot, right), (n, 2 * n), axis=-2)
-    return Innovations(w, W, J.mT, whiten(L_plot, M.mT), distance, log_pdf)
+    right = whiten(L_plot, right)
+    W, J, M = right[..., :n, :], right[..., n : 2 * n, :].mT, right[..., 2 * n :, :].mT
+    return Innovations(w, W, J, whiten(L_plot, M), distance, log_pdf)
 
 
 @cache

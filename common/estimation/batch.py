@@ -11,7 +11,9 @@ Batch = TypeVar("Batch", bound=tuple[Any, ...])
 
 
 def take(batch: Batch, rows: NDArray[Any]) -> Batch:
-    """The chosen rows (a mask or indices) of every array."""
+    """The chosen rows (a mask or indices) of every array; the batch itself where a mask chooses all."""
+    if rows.dtype == np.bool_ and rows.all():
+        return batch
     return type(batch)(*(array[rows] for array in batch))
 
 

@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 
-from common.config import NS_PER_S
 from common.estimation.association import Clutter, Plots, pdaf, tight
 from common.estimation.field_of_view import Everywhere
 from common.estimation.gaussian import Array, Gaussian
@@ -33,6 +32,7 @@ from common.estimation.representation import Share
 from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import thresholds
 from common.messages import NEVER, Report
+from common.quantities import NS_PER_S
 from fusion_center.picture import Fuser
 
 BATCHES = (1, 10, 100, 1000)

@@ -14,10 +14,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from common.config import NS_PER_S, FusionConfig, Scenario
+from common.config import FusionConfig, Scenario
 from common.estimation.gaussian import Gaussian
 from common.estimation.sprt import Status
 from common.messages import NEVER, Advice, Clock, Decision, Join, Message, Report, Start, Stop, Tracks
+from common.quantities import NS_PER_S
 from fusion_center.picture import Fuser, Picture
 
 #: Wall time between the clock's announcement and its start: nodes on a slow link hear of it in time.

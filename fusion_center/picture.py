@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import NS_PER_S, Scenario
+from common.config import Scenario
 from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, BoolArray, Gaussian, product
 from common.estimation.motion import Motion
@@ -17,6 +17,7 @@ from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import Status, StatusArray, Thresholds, decide
 from common.messages import Decision, IntArray, Report
+from common.quantities import NS_PER_S
 
 
 class Picture(NamedTuple):

@@ -13,10 +13,11 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from common.config import MAX_SECONDS, Scenario
+from common.config import Scenario
 from common.errors import PlotsError
 from common.estimation.gaussian import Array
 from common.messages import Scan
+from common.quantities import MAX_SECONDS
 
 #: No coordinate is larger; NaN and infinities are none.
 _LARGEST = 1e15

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import NS_PER_S, Scenario, SensorConfig, TargetConfig
+from common.config import Scenario, SensorConfig, TargetConfig
 from common.errors import ConfigError
 from common.estimation.gaussian import Array
 from common.messages import IntArray, Scan
+from common.quantities import NS_PER_S
 
 
 class Truth(NamedTuple):

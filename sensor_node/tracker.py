@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import NS_PER_S, Scenario, SensorConfig
+from common.config import Scenario, SensorConfig
 from common.estimation.association import Clutter, Plots, pdaf, tight
 from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, Gaussian
@@ -21,6 +21,7 @@ from common.estimation.motion import Motion
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
 from common.messages import Advice, IntArray, Report, Scan, Start, Stop
+from common.quantities import NS_PER_S
 
 #: The honest prior and noise of the association filter.
 HONEST = Share(1.0)

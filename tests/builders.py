@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from common.config import NS_PER_S, Scenario
+from common.config import Scenario
 from common.messages import NEVER, Clock, Decision, Join, Message, Report, Scan, Start, Tracks
+from common.quantities import NS_PER_S
 from fusion_center.center import Center, Event, Tick
 from fusion_center.center import State as CenterState
 from sensor_node.sources import schedule_of

@@ -9,8 +9,9 @@ from builders import Node, Stage, all_same, hypothesis_table, only, reports_of, 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.config import NS_PER_S, Scenario
+from common.config import Scenario
 from common.messages import NEVER, Advice, Clock, Decision, Join, Report, Scan, Start, Stop, Tracks
+from common.quantities import NS_PER_S
 from fusion_center.center import Presence
 from scenarios.world import simulate, simulate_all
 from studies.replay import Replay

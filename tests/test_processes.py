@@ -35,9 +35,10 @@ from process_helpers import (
 )
 
 from common.codec import encode
-from common.config import NS_PER_S, Network, Scenario, load_scenario
+from common.config import Network, Scenario, load_scenario
 from common.estimation.sprt import Status
 from common.messages import Clock, Join, Keys, Report, Scan, Start, Tracks
+from common.quantities import NS_PER_S
 from common.transport import open_zenoh
 from fusion_center.center import Presence
 from scenarios.catalogue import find

@@ -1,0 +1,95 @@
+"""Quantities of scenario files: numbers and instants that say what is wrong with them."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field
+
+NS_PER_S = 1_000_000_000
+#: Times from the epoch, so that nanoseconds since 1970 fit into 64 bits.
+MAX_SECONDS = 4e9
+
+
+def _probability(value: float) -> float:
+    if not 0.0 <= value <= 1.0:
+        raise ValueError(f"{value:g} is not a probability (0 to 1)")
+    return value
+
+
+def _inner_probability(value: float) -> float:
+    if not 0.0 < value < 1.0:
+        raise ValueError(f"{value:g} is not a probability strictly between 0 and 1")
+    return value
+
+
+def _gate_probability(value: float) -> float:
+    if not 0.0 < value <= 1.0:
+        raise ValueError(f"{value:g} is not a probability above 0 (1 is no gate)")
+    return value
+
+
+def _positive(value: float) -> float:
+    if not 0.0 < value < float("inf"):
+        raise ValueError(f"{value:g} is not positive and finite")
+    return value
+
+
+def _not_negative(value: float) -> float:
+    if not 0.0 <= value < float("inf"):
+        raise ValueError(f"{value:g} is not zero or positive and finite")
+    return value
+
+
+def _finite(value: float) -> float:
+    if not np.isfinite(value):
+        raise ValueError(f"{value:g} is not finite")
+    return value
+
+
+def _false_plots(value: float) -> float:
+    if not 0.0 < value < float("inf"):
+        raise ValueError(
+            f"{value:g} is not positive and finite; without false plots one plot would prove a target and there is "
+            "nothing to test: give the smallest mean you believe, such as 1e-6"
+        )
+    return value
+
+
+def _seconds(value: float) -> float:
+    if not -MAX_SECONDS <= value <= MAX_SECONDS:
+        raise ValueError(f"{value:g} s is farther from the epoch than {MAX_SECONDS:g} s")
+    return value
+
+
+def _no_number(value: object) -> object:
+    if isinstance(value, int | float):
+        raise ValueError(f"{value!r} is no instant; write it like 2026-01-01T00:00:00Z")
+    return value
+
+
+def _instant(value: datetime) -> datetime:
+    if value.tzinfo is None:
+        raise ValueError(f"{value.isoformat()} has no time zone; write it like 2026-01-01T00:00:00Z")
+    if not 1900 <= value.year <= 2100:
+        raise ValueError(f"{value.isoformat()} is not between the years 1900 and 2100")
+    return value
+
+
+#: A number and nothing that could be read as one, such as true or "0.5".
+_NUMBER = Field(strict=True)
+Probability = Annotated[float, _NUMBER, AfterValidator(_probability)]
+InnerProbability = Annotated[float, _NUMBER, AfterValidator(_inner_probability)]
+GateProbability = Annotated[float, _NUMBER, AfterValidator(_gate_probability)]
+Positive = Annotated[float, _NUMBER, AfterValidator(_positive)]
+NotNegative = Annotated[float, _NUMBER, AfterValidator(_not_negative)]
+Finite = Annotated[float, _NUMBER, AfterValidator(_finite)]
+FalsePlots = Annotated[float, _NUMBER, AfterValidator(_false_plots)]
+#: For a number that is seconds from the epoch too.
+WITHIN_RANGE = AfterValidator(_seconds)
+Seconds = Annotated[float, _NUMBER, AfterValidator(_finite), WITHIN_RANGE]
+Count = Annotated[int, Field(ge=0, strict=True)]
+Instant = Annotated[datetime, BeforeValidator(_no_number), AfterValidator(_instant)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -105,6 +106,9 @@ def _until_closed(stop: Callable[[], None]) -> None:
 
 def main(app: App, tokens: list[str] | None = None) -> Any:
     """Run a command line; our own errors end with one clear message and exit code 1."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # what a terminal cannot show is shown escaped
+            stream.reconfigure(errors="backslashreplace")
     try:
         result = app(tokens)
         sys.stdout.flush()

@@ -116,7 +116,9 @@ class CenterShell:
     def _say_presence(self, name: str, alive: bool) -> None:
         if name not in self._center.names:
             self.complaints.add("unknown sensor", f"{name!r} is there, but not in scenario {self._scenario.name}")
-        elif not alive and self._state.members[self._center.names.index(name)].next_ns != NEVER:
+            return
+        member = self._state.members[self._center.names.index(name)]
+        if not alive and member.joined and member.next_ns != NEVER:
             self._log.warning("sensor lost; its factors stay, predicted, and the others go on", sensor=name)
 
     def _seconds(self, t_ns: int) -> float | str:

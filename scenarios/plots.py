@@ -58,6 +58,8 @@ def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
         except ValueError as error:
             raise PlotsError(f"{path}:{number}: {error}") from None
         scans.append(scan)
+    if not scans:
+        raise PlotsError(f"{path}: has no scan, expected one a line")
     return in_order(scans, scenario)
 
 

@@ -34,7 +34,9 @@ def draw_log_lr(record: Record, path: Path) -> None:
     FigureCanvasAgg(figure)
     decided, whole = figure.subplots(1, 2, sharey=True)
     curves = {track: (*_with_resets(record, track, h), h) for track, h in record.histories().items()}
-    first = {d.track: record.scenario.to_seconds(d.time_ns) for d in reversed(record.standing())}
+    # A run that was cut short may have heard of a decision and not of its track.
+    standing = [decision for decision in record.standing() if decision.track in curves]
+    first = {d.track: record.scenario.to_seconds(d.time_ns) for d in reversed(standing)}
     for track, (times, log_lr, history) in curves.items():
         colour = COLOUR[Status(int(history.status[-1]))]
         # The value that decided stands before the reset at the same time.

@@ -12,17 +12,20 @@ import pytest
 from builders import Stage, reports_of, scenario
 from process_helpers import PATIENCE_S, variant
 from rich.console import Console
+from structlog.testing import capture_logs
 
 from common.codec import encode
 from common.config import load_scenario
 from common.errors import ConfigError, WaldnetError
 from common.estimation.sprt import Status
-from common.messages import Keys, Scan, Start, Tracks
+from common.messages import Decision, Keys, Scan, Start, Tracks
 from common.transport import MemoryNetwork
+from fusion_center.center import Center
+from fusion_center.shell import CenterShell
 from launch.status import LiveStatus
 from sensor_node.shell import NodeShell
 from sensor_node.tracker import LocalTracker
-from studies.record import Record
+from studies.record import Record, write_report
 
 
 def picture(time_s: float, tracks: dict[int, Status]) -> Tracks:
@@ -83,6 +86,13 @@ def test_a_deletion_that_a_late_report_brings_forward_is_kept() -> None:
     assert record.summary({})["tracks"][0]["status"] == "deleted"
 
 
+def test_a_report_of_a_decision_whose_picture_was_never_heard(tmp_path: Path) -> None:
+    """The center is killed right after it has decided."""
+    record = Record(scenario())
+    record.note(Decision("confirmed", 0, record.scenario.to_ns(2.0), log_lr=10.0, log_lr_total=10.0, scans=1))
+    assert all(file.exists() for file in write_report(record, tmp_path, {}))
+
+
 def test_whoever_joins_a_lockstep_late_does_not_stop_it() -> None:
     stage = Stage(scenario(), wait_s=0.0)
     stage.join("a", 2.0)
@@ -94,7 +104,8 @@ def test_whoever_joins_a_lockstep_late_does_not_stop_it() -> None:
     assert stage.clear_s[-1] == 4.0
     stage.tell(stage.report("b", 4.0))
     assert stage.clear_s[-1] == 6.0
-    assert stage.clear_s == sorted(stage.clear_s)
+    told = [time_s for time_s in stage.clear_s if time_s is not None]
+    assert told == sorted(told)
 
 
 def test_a_node_refuses_tracks_of_another_dimension() -> None:
@@ -118,3 +129,18 @@ def test_no_sensor_may_be_called_like_the_center(tmp_path: Path) -> None:
     """A run keeps its children and their logs by name."""
     with pytest.raises(ConfigError, match=r"sensor\.0\.name: 'center'"):
         load_scenario(variant(tmp_path, "taken", ('name = "radar-1"', 'name = "center"')))
+
+
+def test_a_sensor_that_never_joined_is_not_lost() -> None:
+    memory, plot = MemoryNetwork(), scenario()
+    keys, here = Keys(plot.network.name), threading.Event()
+    with capture_logs() as logs, ThreadPoolExecutor(1) as pool:
+        shell = CenterShell(memory.bus(), plot.network, plot, Center.of(plot))
+        running = pool.submit(shell.run)
+        with memory.bus() as node:
+            node.watch(keys.center_alive(), lambda *_: here.set())
+            assert here.wait(PATIENCE_S)
+            node.announce(keys.sensor_alive("a"))
+        shell.stop()
+        running.result(PATIENCE_S)
+    assert not [entry for entry in logs if "sensor lost" in entry["event"]]

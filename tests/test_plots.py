@@ -78,7 +78,8 @@ def test_scans_come_by_time_and_then_by_sensor(tmp_path: Path) -> None:
 
 def test_empty_lines_do_not_count(tmp_path: Path) -> None:
     assert len(read(tmp_path, "", LINE, "  \t", {**LINE, "sensor": "b"}, "")) == 2
-    assert read(tmp_path) == []
+    with pytest.raises(PlotsError, match="has no scan"):
+        read(tmp_path, "", "")
 
 
 def test_three_dimensions(tmp_path: Path) -> None:

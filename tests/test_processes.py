@@ -21,7 +21,10 @@ from builders import Node, Stage, only
 from process_helpers import (
     ANY_PORT,
     PATIENCE_S,
+    Center,
+    Observer,
     Point,
+    Process,
     Processes,
     assert_agree,
     log_entries,
@@ -215,8 +218,8 @@ def log_of(folder: Path, name: str) -> list[dict[str, Any]]:
 
 
 def test_a_center_that_dies_ends_the_run(processes: Processes, tmp_path: Path) -> None:
-    run = processes.waldnet("run", "four-radars", "--speed", "2", "--out", "out")
-    run.await_line("track 0 confirmed")
+    run = processes.waldnet("run", "four-radars-0.2", "--speed", "8", "--out", "out")
+    run.await_line("track 4 deleted")  # a scan after the confirmation, so that has been heard of for certain
     processes.kill("fusion_center")
     assert run.wait() == 1
     assert len(run.err) == 1
@@ -228,15 +231,15 @@ def test_a_center_that_dies_ends_the_run(processes: Processes, tmp_path: Path) -
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_run_that_is_stopped_writes_its_report(processes: Processes, tmp_path: Path, number: signal.Signals) -> None:
-    run = processes.waldnet("run", "four-radars", "--speed", "2", "--out", "out")
-    run.await_line("track 4 deleted")
+    run = processes.waldnet("run", "four-radars-0.2", "--speed", "8", "--out", "out")
+    run.await_line("track 4 deleted")  # a scan after the confirmation
     run.signal(number)
     assert run.wait() == 0, run.err
     assert run.err == []
     assert "stopped" in run.out
     assert processes.alive() == {}
     report = json.loads((tmp_path / "out" / "decisions.json").read_text())
-    assert [track["status"] for track in report["tracks"]] == ["confirmed", *4 * ["deleted"]]
+    assert report["tracks"][0]["status"] == "confirmed"
     assert report["sensors_lost"] == {}
     assert (tmp_path / "out" / "plan.png").stat().st_size > 20_000
 
@@ -310,6 +313,8 @@ NAMES = "autoferry-2, autoferry-5, four-radars, "
         (("simulate", "four-radars", "--out", "no/folder.jsonl"), r"no/folder\.jsonl: .*No such file or directory"),
         (("run", "four-radars", "--speed", "max", "--out", "bad.toml"), r"bad\.toml: .*File exists"),
         (("replay", "four-radars", "late.jsonl"), r"late\.jsonl:1: time: .*"),
+        (("replay", "four-radars", "empty.jsonl"), r"empty\.jsonl: has no scan.*"),
+        (("run", "four-radars", "--plots", "empty.jsonl"), r".*/empty\.jsonl: has no scan.*"),
         (("replay", "ancient.toml"), r"ancient\.toml: epoch: .*"),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else "",
@@ -320,6 +325,7 @@ def test_what_is_wrong_is_said_in_one_line(
     variant(tmp_path, "bad", ("psd = 10.0", "psd = -1.0"))
     variant(tmp_path, "ancient", ("2026-01-01", "1026-01-01"))
     (tmp_path / "bad.jsonl").write_text(BAD_PLOTS)
+    (tmp_path / "empty.jsonl").write_text("")
     (tmp_path / "late.jsonl").write_text('{"sensor": "radar-1", "time": 1e300, "plots": []}\n')
     process = processes.waldnet(*arguments)
     assert process.wait() == 1, process.err
@@ -438,7 +444,9 @@ def test_two_networks_on_one_router_do_not_meet(processes: Processes) -> None:
     seeds = {"one": 1, "two": 2}
     client = ("--mode", "client", "--connect", *at)
     with ExitStack() as stack:
-        centers, nodes, observers = [], [], {}
+        centers: list[Center] = []
+        nodes: list[Process] = []
+        observers: dict[str, Observer] = {}
         for name in seeds:
             options = ("--network-name", name, *client, "--speed", "max", "--wait", PATIENCE_S)
             centers.append(start_center(processes, path, *options))
@@ -560,3 +568,9 @@ def test_a_reader_who_has_seen_enough_may_leave() -> None:
 
 def test_the_version_is_that_of_the_package(processes: Processes) -> None:
     assert processes.output("--version") == [version("waldnet")]
+
+
+def test_a_terminal_that_knows_only_ascii(processes: Processes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    (processes.cwd / "größe.jsonl").write_text('{"sensor": "radar-1", "time": 2.0, "plots": []}\n')
+    assert processes.output("check", "four-radars", "größe.jsonl")[-1].endswith("1 scans, 0 plots")

@@ -25,6 +25,7 @@ from common.messages import (
     DecisionKind,
     Join,
     Message,
+    Proposal,
     Report,
     Scan,
     Start,
@@ -57,18 +58,17 @@ def _floats(field: str, *axes: str) -> Block:
 
 
 _IDS = Block("ids", "<u4", ("T",), "i8")
+_TERMS = Block("terms", "u1", ("T",), "i8")
+
+#: Kind of a report whose densities are rounded; log g, which grows without end, is not.
+ROUNDED = 10
 
 #: Blocks of every kind of message; the number is the kind on the wire.
 LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
-    1: (
+    1: (Report, (_IDS, _TERMS, _floats("log_g", "N"), _floats("x", "N", "n"), _floats("P", "N", "n^"))),
+    ROUNDED: (
         Report,
-        (
-            _IDS,
-            Block("terms", "u1", ("T",), "i8"),
-            _floats("log_g", "N"),
-            _floats("x", "N", "n"),
-            _floats("P", "N", "n^"),
-        ),
+        (_IDS, _TERMS, _floats("log_g", "N"), Block("x", "<f4", ("N", "n")), Block("P", "<f4", ("N", "n^"))),
     ),
     2: (Scan, (_floats("position", "d"), _floats("z", "M", "m"))),
     3: (Join, ()),
@@ -101,12 +101,13 @@ LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
         ),
     ),
     9: (Decision, ()),
+    11: (Proposal, (_floats("x", "T", "n"), _floats("P", "T", "n^"))),
 }
-_KINDS = {message: kind for kind, (message, _) in LAYOUTS.items()}
+_KINDS = {message: kind for kind, (message, _) in LAYOUTS.items() if kind != ROUNDED}
 #: No state is larger; keeps a forged header from asking for memory.
 _MAX_STATE = 64
 #: Messages whose sensor is the one in the key.
-_KEYED = (Report, Scan, Join, Start, Stop)
+_KEYED = (Report, Scan, Join, Start, Stop, Proposal)
 
 _TO_WIRE: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "str": str, "tuple": list}
 _EXPECTED = {"int": "a 64-bit integer", "float": "a finite float", "str": "a text", "tuple": "an array of texts"}
@@ -114,13 +115,17 @@ _EXPECTED = {"int": "a 64-bit integer", "float": "a finite float", "str": "a tex
 _AnyArray: TypeAlias = NDArray[Any]
 
 
-def encode(message: Message) -> bytes:
+def encode(message: Message, *, rounded: bool = False) -> bytes:
     """A message as bytes.
+
+    Args:
+        message: to send.
+        rounded: send the densities of a report in single precision.
 
     Returns:
         the payload; the name of the sensor it comes from or goes to is in the key instead.
     """
-    kind = _KINDS[type(message)]
+    kind = ROUNDED if rounded and isinstance(message, Report) else _KINDS[type(message)]
     sizes: dict[str, int] = {}
     raw = []
     for block in LAYOUTS[kind][1]:
@@ -210,7 +215,7 @@ def _decode_scalars(message: type, expected: tuple[tuple[str, str], ...], scalar
 
 
 def _decode_blocks(layout: tuple[Block, ...], sizes: Any, blocks: Any) -> dict[str, _AnyArray]:
-    axes = list(dict.fromkeys(axis.rstrip("^") for block in layout for axis in block.axes))
+    axes = _axes(layout)
     if not isinstance(sizes, list) or len(sizes) != len(axes) or not all(_is_int(size) and size >= 0 for size in sizes):
         raise DecodeError(f"expected the sizes of the axes {', '.join(axes) or '(none)'}")
     if not isinstance(blocks, bytes):
@@ -219,7 +224,7 @@ def _decode_blocks(layout: tuple[Block, ...], sizes: Any, blocks: Any) -> dict[s
     if any(size > max(_MAX_STATE, len(blocks)) for size in sizes) or size_of.get("n", 0) > _MAX_STATE:
         raise DecodeError(f"sizes {sizes} are larger than the {len(blocks)} bytes of blocks can hold")
     counts = [_count(block, size_of) for block in layout]
-    expected = sum(count * np.dtype(block.dtype).itemsize for block, count in zip(layout, counts, strict=True))
+    expected = sum(count * int(block.dtype[-1]) for block, count in zip(layout, counts, strict=True))
     if expected != len(blocks):
         raise DecodeError(f"{len(blocks)} bytes of blocks, expected {expected}")
     fields: dict[str, _AnyArray] = {}
@@ -255,13 +260,13 @@ def _shape(flat: _AnyArray, block: Block, size_of: dict[str, int]) -> _AnyArray:
 def _check_numbers(message: Message) -> None:
     """Finite numbers, ascending ids."""
     for name, value in message._asdict().items():
-        if isinstance(value, np.ndarray) and value.dtype == np.float64:
+        if isinstance(value, np.ndarray) and value.dtype == np.float64 and not np.isfinite(value).all():
             # log p_bar of a scan that h1 holds for impossible is -inf.
             bad = np.isnan(value) | (value == np.inf) if name.startswith("log_") else ~np.isfinite(value)
             if bad.any():
                 raise DecodeError(f"{name} has {int(bad.sum())} values that are not finite")
     ids = getattr(message, "ids", None)
-    if ids is not None and (np.diff(ids) <= 0).any():
+    if ids is not None and (ids[1:] <= ids[:-1]).any():
         raise DecodeError("ids are not ascending")
 
 
@@ -297,6 +302,12 @@ def _scalars(kind: int) -> tuple[tuple[str, str], ...]:
         for name, hint in get_type_hints(message).items()
         if name not in blocks and not (name == "sensor" and message in _KEYED)
     )
+
+
+@cache
+def _axes(layout: tuple[Block, ...]) -> tuple[str, ...]:
+    """Names of the axes, in the order in which they first appear."""
+    return tuple(dict.fromkeys(axis.rstrip("^") for block in layout for axis in block.axes))
 
 
 @cache

@@ -91,6 +91,7 @@ class FusionConfig(_Model):
         association: the factor's own, or tight (theory.md §5).
         feedback: advice gives the fused track back to the association filters (theory.md §6).
         filter: local filter.
+        precision: of means and covariances in reports; float32 halves them.
         gate_probability: that the target's plot lies inside the gate; 1 is no gate.
         hold_back: how long the center waits for a sensor that is overdue [s].
         window: how far back a late report is still worked in [s of measurement time].
@@ -100,6 +101,7 @@ class FusionConfig(_Model):
     association: Literal["factor", "tight"] = "tight"
     feedback: Literal["none", "advice"] = "none"
     filter: Literal["pdaf"] = "pdaf"
+    precision: Literal["float64", "float32"] = "float64"
     gate_probability: GateProbability = 0.9997
     hold_back: NotNegative = 0.5
     window: NotNegative = 10.0

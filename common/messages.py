@@ -66,6 +66,21 @@ class Scan(NamedTuple):
     z: Array
 
 
+class Proposal(NamedTuple):
+    """Tracks that a sensor proposes to start, from plots that no track claims (theory.md §8).
+
+    Attributes:
+        sensor: who proposes.
+        time_ns: of the scan.
+        x, P: densities, shapes (T, n), (T, n, n).
+    """
+
+    sensor: str
+    time_ns: int
+    x: Array
+    P: Array
+
+
 class Join(NamedTuple):
     """A sensor node is ready and asks for the tracks.
 
@@ -188,7 +203,7 @@ class Decision(NamedTuple):
     scans: int
 
 
-Message: TypeAlias = Report | Scan | Join | Start | Stop | Advice | Clock | Tracks | Decision
+Message: TypeAlias = Report | Scan | Proposal | Join | Start | Stop | Advice | Clock | Tracks | Decision
 
 
 class Keys(NamedTuple):
@@ -203,6 +218,10 @@ class Keys(NamedTuple):
     def plots(self, sensor: str = "*") -> str:
         """Sensor node to whoever displays or records."""
         return f"waldnet/{self.network}/sensor/{sensor}/plots"
+
+    def proposal(self, sensor: str = "*") -> str:
+        """Sensor node to center."""
+        return f"waldnet/{self.network}/sensor/{sensor}/proposal"
 
     def join(self, sensor: str = "*") -> str:
         """Sensor node to center."""
@@ -251,6 +270,8 @@ class Keys(NamedTuple):
                 return self.report(message.sensor)
             case Scan():
                 return self.plots(message.sensor)
+            case Proposal():
+                return self.proposal(message.sensor)
             case Join():
                 return self.join(message.sensor)
             case Start() | Stop():

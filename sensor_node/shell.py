@@ -236,4 +236,5 @@ class NodeShell:
         return self._position == len(self._scans)
 
     def _publish(self, message: Message) -> None:
-        self._publishers[self._keys.of(message)].put(encode(message))
+        payload = encode(message, rounded=self._tracker.rounded)
+        self._publishers[self._keys.of(message)].put(payload)

@@ -95,6 +95,7 @@ class LocalTracker:
         share: its share of prior and process noise.
         tight: associate with a filter of its own (theory.md §5).
         advised: the fused track comes back as advice (theory.md §6).
+        rounded: reports are in single precision.
         digest: of what the center must have in common with this node.
         gate_probability: that the target's plot is inside the gate.
         buffer_ns: how long scans are kept.
@@ -109,6 +110,7 @@ class LocalTracker:
     share: Share
     tight: bool
     advised: bool
+    rounded: bool
     digest: str
     gate_probability: float
     buffer_ns: int
@@ -137,6 +139,7 @@ class LocalTracker:
             share=scenario.share,
             tight=scenario.fusion.association == "tight",
             advised=scenario.fusion.feedback == "advice",
+            rounded=scenario.fusion.precision == "float32",
             digest=scenario.digest,
             gate_probability=scenario.fusion.gate_probability,
             buffer_ns=round(scenario.fusion.window * NS_PER_S),
@@ -158,6 +161,9 @@ class LocalTracker:
         filtered = self._filter(take(state.tracks, live), scan)
         tracks = filtered if live.all() else put(state.tracks, live, filtered)
         kept = tuple(old for old in state.recent if old.time_ns >= scan.time_ns - self.buffer_ns)
+        x, P = filtered.x, filtered.P
+        if self.rounded:
+            x, P = x.astype(np.float32).astype(np.float64), P.astype(np.float32).astype(np.float64)
         report = Report(
             sensor=self.config.name,
             sequence=state.sequence,
@@ -167,8 +173,8 @@ class LocalTracker:
             ids=filtered.ids,
             terms=np.ones_like(filtered.ids),
             log_g=filtered.log_p_bar,
-            x=filtered.x,
-            P=filtered.P,
+            x=x,
+            P=P,
         )
         return State(state.epoch, state.sequence + 1, tracks, (*kept, scan), state.advice), report
 

@@ -10,7 +10,7 @@ from builders import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.codec import LAYOUTS, VERSION, decode, encode
+from common.codec import LAYOUTS, ROUNDED, VERSION, decode, encode
 from common.errors import DecodeError, VersionError
 from common.messages import (
     NEVER,
@@ -20,6 +20,7 @@ from common.messages import (
     Join,
     Keys,
     Message,
+    Proposal,
     Report,
     Scan,
     Start,
@@ -100,6 +101,17 @@ def scan(plots: int, d: int = 2) -> Scan:
     return Scan("radar-1", EPOCH_NS, rng.standard_normal(d), rng.standard_normal((plots, d)))
 
 
+def proposal(tracks: int, n: int = 4) -> Proposal:
+    rng = np.random.default_rng(tracks)
+    return Proposal("radar-1", EPOCH_NS, rng.standard_normal((tracks, n)), covariances(rng, tracks, n))
+
+
+def rounded(message: Report) -> Report:
+    """A report whose densities fit into single precision."""
+    x, P = (array.astype(np.float32).astype(np.float64) for array in (message.x, message.P))
+    return message._replace(x=x, P=P)
+
+
 MESSAGES: dict[str, Message] = {
     **{f"report-{t}": report(t) for t in (0, 1, 100)},
     "report-3d": report(2, n=6),
@@ -109,6 +121,8 @@ MESSAGES: dict[str, Message] = {
     "report-last": report(1)._replace(next_ns=NEVER),
     **{f"scan-{m}": scan(m) for m in (0, 1, 100)},
     "scan-3d": scan(2, d=3),
+    **{f"proposal-{t}": proposal(t) for t in (0, 1, 100)},
+    "proposal-3d": proposal(2, n=6),
     "join": Join("radar-1", 2**63 - 1, EPOCH_NS, "0123456789abcdef"),
     "join-never": Join("radar-1", 0, NEVER, ""),
     **{f"start-{t}": start(t) for t in (0, 1, 100)},
@@ -221,6 +235,19 @@ GOLDEN = [
 ]
 
 
+GOLDEN_ROUNDED = (
+    "95 01 0a 94 03 0a cf7fffffffffffffff 02 93 01 01 02"
+    "c4 21 07000000 01 000000000000e0bf"  # log_g in full
+    "0000803f 00000040 00008040 0000803f 00004040"  # x, P
+)
+
+
+def test_the_bytes_of_a_rounded_report_never_change() -> None:
+    payload = bytes.fromhex(GOLDEN_ROUNDED)
+    assert encode(GOLDEN_REPORT, rounded=True) == payload
+    assert same(decode(KEYS.of(GOLDEN_REPORT), payload), GOLDEN_REPORT)
+
+
 @pytest.mark.parametrize(("message", "golden"), GOLDEN, ids=["report", "start"])
 def test_the_bytes_of_version_1_never_change(message: Message, golden: str) -> None:
     payload = bytes.fromhex(golden)
@@ -230,6 +257,21 @@ def test_the_bytes_of_version_1_never_change(message: Message, golden: str) -> N
 
 def test_a_report_of_100_tracks_takes_at_most_140_bytes_a_track() -> None:
     assert len(encode(report(100))) <= 140 * 100
+
+
+def test_a_rounded_report_of_100_tracks_takes_at_most_72_bytes_a_track() -> None:
+    assert len(encode(report(100), rounded=True)) <= 72 * 100
+
+
+@pytest.mark.parametrize("message", [report(0), report(100), report(2, n=6), report(5, terms=3)])
+def test_a_rounded_report_keeps_its_evidence_and_what_fits(message: Report) -> None:
+    payload = encode(message, rounded=True)
+    assert msgpack.unpackb(payload)[1] == ROUNDED
+    assert same(decode(KEYS.of(message), payload), rounded(message))
+
+
+def test_only_reports_are_rounded() -> None:
+    assert encode(start(3), rounded=True) == encode(start(3))
 
 
 @pytest.mark.parametrize("version", [0, VERSION + 1, 7, -1, 2**64 - 1])
@@ -243,7 +285,7 @@ def test_another_version_is_refused_whatever_follows(version: int) -> None:
         )
 
 
-@pytest.mark.parametrize("message", [report(1), scan(1), MESSAGES["join"], start(1), Stop("radar-1", ids(1))])
+@pytest.mark.parametrize("message", [report(1), scan(1), proposal(1), MESSAGES["join"], start(1), Stop("radar-1", ids(1))])
 def test_a_message_about_a_sensor_needs_a_key_with_one(message: Message) -> None:
     key = "waldnet/coast/center/tracks"
     payload = encode(message)
@@ -261,7 +303,7 @@ def floats(message: Message) -> list[str]:
 
 
 FLOATS = [
-    (message, name) for message in (report(1), scan(1), start(1), advice(1), picture(1)) for name in floats(message)
+    (message, name) for message in (report(1), scan(1), proposal(1), start(1), advice(1), picture(1)) for name in floats(message)
 ]
 FLOAT_NAMES = [f"{type(message).__name__}.{name}" for message, name in FLOATS]
 
@@ -450,6 +492,7 @@ def test_every_message_has_its_key() -> None:
     assert keys == {
         "Report": "waldnet/coast/sensor/radar-1/report",
         "Scan": "waldnet/coast/sensor/radar-1/plots",
+        "Proposal": "waldnet/coast/sensor/radar-1/proposal",
         "Join": "waldnet/coast/sensor/radar-1/join",
         "Start": "waldnet/coast/center/command/radar-1",
         "Stop": "waldnet/coast/center/command/radar-1",

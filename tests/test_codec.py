@@ -285,7 +285,9 @@ def test_another_version_is_refused_whatever_follows(version: int) -> None:
         )
 
 
-@pytest.mark.parametrize("message", [report(1), scan(1), proposal(1), MESSAGES["join"], start(1), Stop("radar-1", ids(1))])
+@pytest.mark.parametrize(
+    "message", [report(1), scan(1), proposal(1), MESSAGES["join"], start(1), Stop("radar-1", ids(1))]
+)
 def test_a_message_about_a_sensor_needs_a_key_with_one(message: Message) -> None:
     key = "waldnet/coast/center/tracks"
     payload = encode(message)
@@ -303,7 +305,9 @@ def floats(message: Message) -> list[str]:
 
 
 FLOATS = [
-    (message, name) for message in (report(1), scan(1), proposal(1), start(1), advice(1), picture(1)) for name in floats(message)
+    (message, name)
+    for message in (report(1), scan(1), proposal(1), start(1), advice(1), picture(1))
+    for name in floats(message)
 ]
 FLOAT_NAMES = [f"{type(message).__name__}.{name}" for message, name in FLOATS]
 

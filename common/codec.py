@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from functools import cache
+from functools import cache, lru_cache
 from typing import Any, NamedTuple, TypeAlias, get_args, get_type_hints
 
 import msgpack
@@ -177,9 +177,9 @@ def _decode_body(sensor: str, body: list[Any]) -> Message:
     kind, scalars, sizes, blocks = body
     if not _is_int(kind) or kind not in LAYOUTS:
         raise DecodeError(f"kind {_shown(kind)} is unknown")
-    message, layout = LAYOUTS[kind]
+    message = LAYOUTS[kind][0]
     fields = _decode_scalars(message, _scalars(kind), scalars)
-    fields.update(_decode_blocks(layout, sizes, blocks))
+    fields.update(_decode_blocks(kind, sizes, blocks))
     if message in _KEYED:
         if not sensor:
             raise DecodeError(f"a {message.__name__} does not belong on this key")
@@ -214,47 +214,55 @@ def _decode_scalars(message: type, expected: tuple[tuple[str, str], ...], scalar
     return fields
 
 
-def _decode_blocks(layout: tuple[Block, ...], sizes: Any, blocks: Any) -> dict[str, _AnyArray]:
-    axes = _axes(layout)
+def _decode_blocks(kind: int, sizes: Any, blocks: Any) -> dict[str, _AnyArray]:
+    axes = _axes(kind)
     if not isinstance(sizes, list) or len(sizes) != len(axes) or not all(_is_int(size) and size >= 0 for size in sizes):
         raise DecodeError(f"expected the sizes of the axes {', '.join(axes) or '(none)'}")
     if not isinstance(blocks, bytes):
         raise DecodeError(f"blocks are a {type(blocks).__name__}, expected bin")
-    size_of = dict(zip(axes, sizes, strict=True))
-    if any(size > max(_MAX_STATE, len(blocks)) for size in sizes) or size_of.get("n", 0) > _MAX_STATE:
+    most = max(_MAX_STATE, len(blocks))
+    if any(size > (_MAX_STATE if axis == "n" else most) for axis, size in zip(axes, sizes, strict=True)):
         raise DecodeError(f"sizes {sizes} are larger than the {len(blocks)} bytes of blocks can hold")
-    counts = [_count(block, size_of) for block in layout]
-    expected = sum(count * int(block.dtype[-1]) for block, count in zip(layout, counts, strict=True))
+    places, expected = _places(kind, tuple(sizes))
     if expected != len(blocks):
         raise DecodeError(f"{len(blocks)} bytes of blocks, expected {expected}")
     fields: dict[str, _AnyArray] = {}
-    offset = 0
-    for block, count in zip(layout, counts, strict=True):
-        flat = np.frombuffer(blocks, block.dtype, count, offset)
-        offset += flat.nbytes
-        fields[block.field] = _shape(flat.astype(block.kind), block, size_of)
+    for block, place in zip(LAYOUTS[kind][1], places, strict=True):
+        array = np.frombuffer(blocks, block.dtype, place.numbers, place.offset).astype(block.kind).reshape(place.shape)
+        fields[block.field] = array if place.full is None else array[..., place.full]
     return fields
 
 
-def _count(block: Block, size_of: dict[str, int]) -> int:
-    count = 1
-    for axis in block.axes:
-        size = size_of[axis.rstrip("^")]
-        count *= size * (size + 1) // 2 if axis.endswith("^") else size
-    return count
+class _Place(NamedTuple):
+    """Where an array stands in the blocks.
+
+    Attributes:
+        offset: its first byte.
+        numbers: how many there are.
+        shape: as it stands there.
+        full: of a triangle, for every element of the matrix its place in it.
+    """
+
+    offset: int
+    numbers: int
+    shape: tuple[int, ...]
+    full: _AnyArray | None
 
 
-def _shape(flat: _AnyArray, block: Block, size_of: dict[str, int]) -> _AnyArray:
-    if not block.axes[-1].endswith("^"):
-        return flat.reshape([size_of[axis] for axis in block.axes])
-    n = size_of[block.axes[-1].rstrip("^")]
-    lead = [size_of[axis] for axis in block.axes[:-1]]
-    upper = flat.reshape((*lead, n * (n + 1) // 2))
-    full = np.empty((*lead, n, n))
-    rows, columns = _upper(n)
-    full[..., rows, columns] = upper
-    full[..., columns, rows] = upper
-    return full
+@lru_cache(maxsize=512)
+def _places(kind: int, sizes: tuple[int, ...]) -> tuple[tuple[_Place, ...], int]:
+    """The places of all arrays of a message with axes of these sizes, and the bytes they take together."""
+    size_of = dict(zip(_axes(kind), sizes, strict=True))
+    places, offset = [], 0
+    for block in LAYOUTS[kind][1]:
+        triangle = block.axes[-1].endswith("^")
+        shape = [size_of[axis.rstrip("^")] for axis in block.axes]
+        full = _full(shape[-1]) if triangle else None
+        if triangle:
+            shape[-1] = shape[-1] * (shape[-1] + 1) // 2
+        places.append(_Place(offset, math.prod(shape), tuple(shape), full))
+        offset += math.prod(shape) * np.dtype(block.dtype).itemsize
+    return tuple(places), offset
 
 
 def _check_numbers(message: Message) -> None:
@@ -305,9 +313,18 @@ def _scalars(kind: int) -> tuple[tuple[str, str], ...]:
 
 
 @cache
-def _axes(layout: tuple[Block, ...]) -> tuple[str, ...]:
-    """Names of the axes, in the order in which they first appear."""
-    return tuple(dict.fromkeys(axis.rstrip("^") for block in layout for axis in block.axes))
+def _axes(kind: int) -> tuple[str, ...]:
+    """Names of the axes of a kind of message, in the order in which they first appear."""
+    return tuple(dict.fromkeys(axis.rstrip("^") for block in LAYOUTS[kind][1] for axis in block.axes))
+
+
+@cache
+def _full(n: int) -> _AnyArray:
+    """For every element of a symmetric matrix, its place in the upper triangle, shape (n, n)."""
+    rows, columns = np.indices((n, n))
+    low, high = np.minimum(rows, columns), np.maximum(rows, columns)
+    places: _AnyArray = low * n - low * (low - 1) // 2 + high - low
+    return places
 
 
 @cache

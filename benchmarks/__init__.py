@@ -1,0 +1,1 @@
+"""What the network costs: ``waldnet bench``, and the figures of docs/performance.md."""

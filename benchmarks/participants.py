@@ -1,0 +1,113 @@
+"""Node and center as processes of a benchmark: the product's shells, with a watch in the hand.
+
+    python -m benchmarks.participants node WORLD NAME CENTER
+    python -m benchmarks.participants center WORLD SPEED
+
+Clocks are the machine's monotonic one, which all its processes share. The stamps of a run are printed at its end.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+
+from benchmarks.worlds import World
+from common.config import Network
+from common.inbox import Inbox
+from common.logs import configure
+from common.messages import Message, Report, Scan, Tracks
+from common.process import stopped_by_signals
+from common.transport import open_zenoh
+from fusion_center.center import Center
+from fusion_center.shell import CenterShell
+from sensor_node.shell import NodeShell
+from sensor_node.tracker import LocalTracker
+
+
+class TimedNode(NodeShell):
+    """Notes for every scan: its time, when work began, when the report was out."""
+
+    stamps: list[tuple[int, int, int]]
+    _began_at = 0
+
+    def _process(self, scan: Scan) -> None:
+        self._began_at = time.monotonic_ns()
+        super()._process(scan)
+
+    def _publish(self, message: Message) -> None:
+        super()._publish(message)
+        if isinstance(message, Report):
+            self.stamps.append((message.time_ns, self._began_at, time.monotonic_ns()))
+
+
+class TimedCenter(CenterShell):
+    """Notes for every picture: its time, and when it was out."""
+
+    stamps: list[tuple[int, int]]
+
+    def _publish(self, message: Message) -> None:
+        super()._publish(message)
+        if isinstance(message, Tracks):
+            self.stamps.append((message.time_ns, time.monotonic_ns()))
+
+
+class TimedInbox(Inbox):
+    """Notes when each report came in."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stamps: list[tuple[bytes, int]] = []
+
+    def heard(self, key: str, payload: bytes) -> None:
+        """Put bytes."""
+        now = time.monotonic_ns()
+        super().heard(key, payload)
+        if key.endswith("/report"):
+            self.stamps.append((payload, now))
+
+
+def node(world: World, name: str, center: str) -> dict[str, object]:
+    """Run one sensor node to its end; returns its stamps."""
+    scenario = world.scenario()
+    network = Network(name=scenario.network.name, connect=(center,))
+    inbox = Inbox()
+    scans = world.seen_by(name)
+    with stopped_by_signals(inbox.stop, with_parent=True), open_zenoh(network) as bus:
+        shell = TimedNode(bus, network, LocalTracker.of(scenario, name), scans, inbox=inbox)
+        shell.stamps = []
+        shell.run()
+    return {"node": shell.stamps}
+
+
+def center(world: World, speed: float) -> dict[str, object]:
+    """Run the center to its end; returns its stamps."""
+    from common.codec import decode
+
+    scenario = world.scenario()
+    network = Network(name=scenario.network.name, listen=("tcp/127.0.0.1:0",))
+    inbox = TimedInbox()
+    with stopped_by_signals(inbox.stop, with_parent=True), open_zenoh(network) as bus:
+        print(json.dumps({"listening": bus.endpoints()}), flush=True)
+        fusion = Center.of(scenario, speed=speed, wait_s=60.0, first_epoch=time.time_ns())
+        shell = TimedCenter(bus, network, scenario, fusion, inbox=inbox)
+        shell.stamps = []
+        shell.run()
+    came: dict[int, int] = {}
+    for payload, at in inbox.stamps:
+        message = decode("waldnet/bench/sensor/any/report", payload)
+        assert isinstance(message, Report)
+        came[message.time_ns] = max(at, came.get(message.time_ns, 0))
+    return {"center": shell.stamps, "came": list(came.items())}
+
+
+def main() -> None:
+    """Play the part that the command line names."""
+    configure("json")
+    role, world, *rest = sys.argv[1:]
+    stamps = node(World.of(world), *rest) if role == "node" else center(World.of(world), float(rest[0]))
+    print(json.dumps(stamps), flush=True)
+
+
+if __name__ == "__main__":
+    main()

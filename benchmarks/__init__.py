@@ -1,0 +1,1 @@
+"""Measurements, and the networks of bad links they and the tests run on."""

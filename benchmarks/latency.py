@@ -1,15 +1,15 @@
 """From the last node's scan to the decision at a subscriber, beside raw Zenoh and raw TCP in the same run.
 
-All processes are real and on this machine: the nodes, the center, a subscriber. A cycle begins when the last of the nodes
-starts to work on its scan and ends when the picture of that measurement time, decisions taken, is in the subscriber's
-hands. It is split into ``node`` (plots to report handed over), ``center`` (last report in to picture handed over) and the
-rest: the wire with its wake-ups. At scan rate the three ways take turns within every interval, so that they share
-whatever else the machine does; flat out (lockstep: the next scan as soon as the center allows) one follows the other.
+All processes are real and on this machine: the nodes, the center, a subscriber. A cycle begins when the last of the
+nodes starts to work on its scan and ends when the picture of that measurement time, decisions taken, is in the
+subscriber's hands. It is split into ``node`` (plots to report handed over), ``center`` (last report in to picture
+handed over) and the rest: the wire with its wake-ups. At scan rate the three ways take turns within every interval, so
+that they share whatever else the machine does; flat out (lockstep: the next scan as soon as the center allows) one
+follows the other.
 """
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.crew import BenchError, Crew, Member
-from benchmarks.raw import frame, link_to, number_of
+from benchmarks.raw import link_to, number_of
 from benchmarks.worlds import World
 from common.codec import decode, encode
 from common.config import Network

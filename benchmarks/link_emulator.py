@@ -206,6 +206,8 @@ def build_bridge(hosts: int) -> list[int]:
             _ip(f"link add port{number} type veth peer name {_INTERFACE} netns /proc/{os.getpid()}/fd/{namespace}")
             _ip(f"link set port{number} master hub up")
         with inside(namespace):
+            # Counted as on a cable: every packet with its headers, not the large ones that the kernel makes of them.
+            _ip(f"link set {_INTERFACE} gso_max_segs 1")
             _set_up(number)
     return namespaces
 

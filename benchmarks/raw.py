@@ -6,8 +6,8 @@ and whoever listens takes the time. Over Zenoh with its plain publisher and call
     python -m benchmarks.raw relay zenoh|tcp SENDERS SIZE
     python -m benchmarks.raw sender zenoh|tcp WHERE SIZE INTERVAL_NS COUNT
 
-A sender is told on standard input at which nanosecond of the monotonic clock to start; with interval 0 it puts as soon as
-the relay has answered the last one, as nodes do in lockstep. Its stamps are printed at the end.
+A sender is told on standard input at which nanosecond of the monotonic clock to start; with interval 0 it puts as soon
+as the relay has answered the last one, as nodes do in lockstep. Its stamps are printed at the end.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
+from benchmarks.cli import bench
 from common.config import Network, Scenario, load_scenario
 from common.estimation.sprt import Status
 from common.logs import LogFormat, configure
@@ -29,6 +30,7 @@ app = App(
 )
 app.command(node)
 app.command(center)
+app.command(bench)
 
 
 @app.command

@@ -1,0 +1,105 @@
+"""``waldnet bench``: what a network costs, measured on this machine."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import App, Parameter, validators
+from rich.console import Console
+
+bench = App(name="bench", help="Measure what a network costs on this machine: bandwidth, latency, precision.")
+
+Numbers = Annotated[tuple[int, ...], Parameter(negative=(), validator=validators.Number(gte=1), consume_multiple=True)]
+Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
+
+
+@bench.command
+def latency(
+    *,
+    tracks: Numbers = (1, 100, 1000),
+    sensors: Numbers = (4, 16),
+    scans: Count = 1000,
+    rate: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 10.0,
+    json_file: Annotated[Path | None, Parameter(name="--json")] = None,
+) -> None:
+    """From the last node's scan to the decision at a subscriber, at scan rate and flat out, beside raw Zenoh and TCP.
+
+    Args:
+        tracks: numbers of tracks.
+        sensors: numbers of sensors.
+        scans: measured cycles of a row; a fifth, at a fifth of the rate, for more than 4000 tracks times sensors.
+        rate: scans per second.
+        json_file: file to write the rows to.
+    """
+    from benchmarks.latency import Cell, measure, table
+
+    rows = []
+    for number in sensors:
+        for many in tracks:
+            slower = 5 if many * number > 4000 else 1
+            cells = [Cell(many, number, pace, max(1, scans // slower)) for pace in (rate / slower, 0.0)]
+            rows += [_say(measure(cell)) for cell in cells]
+    _finish(rows, table(rows), json_file, "numpy", "eclipse-zenoh")
+
+
+@bench.command
+def bandwidth(
+    *,
+    tracks: Numbers = (1, 10, 100, 1000),
+    sensors: Numbers = (2, 4, 8, 16, 32),
+    false_plots: Numbers = (1, 10, 100, 1000),
+    scans: Count = 10,
+    interval: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 1.0,
+    json_file: Annotated[Path | None, Parameter(name="--json")] = None,
+    figure: Path | None = None,
+) -> None:
+    """Bytes per track and scan of reports and proposals, and of sending all plots instead; needs root and Linux.
+
+    Each axis is varied while the others stay at 100 tracks, 4 sensors, 10 false plots.
+
+    Args:
+        tracks: numbers of tracks.
+        sensors: numbers of sensors.
+        false_plots: mean numbers of false plots per sensor and scan.
+        scans: measured of every sensor.
+        interval: seconds between scans; heartbeats weigh more when scans are rare.
+        json_file: file to write the rows to.
+        figure: PNG file to draw to.
+    """
+    from benchmarks.bandwidth import draw, measure, table, worlds
+
+    rows = [_say(row) for row in measure(worlds(tracks, sensors, false_plots), scans, interval)]
+    if figure is not None:
+        draw(rows, figure)
+    _finish(rows, table(rows), json_file, "eclipse-zenoh")
+
+
+@bench.command
+def precision(*, scans: Count = 1000, json_file: Annotated[Path | None, Parameter(name="--json")] = None) -> None:
+    """What reports in single precision (fusion.precision = "float32") do to log LR after many scans.
+
+    Args:
+        scans: of every sensor; the scenario with 32 sensors takes a fifth.
+        json_file: file to write the rows to.
+    """
+    from benchmarks.precision import SCENARIOS, compare, table
+
+    rows = [_say(compare(name, max(1, scans // 5) if name == "thirty-two" else scans)) for name in SCENARIOS]
+    _finish(rows, table(rows), json_file, "numpy")
+
+
+def _say(row: dict[str, Any]) -> dict[str, Any]:
+    """Tell people that another row is there."""
+    Console(stderr=True, highlight=False).print(", ".join(f"{key} {value}" for key, value in row.items()), style="dim")
+    return row
+
+
+def _finish(rows: Sequence[dict[str, Any]], table: str, json_file: Path | None, *packages: str) -> None:
+    from benchmarks.machine import described
+
+    if json_file is not None:
+        json_file.write_text(json.dumps(rows, indent=2) + "\n")
+    print(f"{described(*packages)}\n\n{table}")

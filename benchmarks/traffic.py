@@ -1,0 +1,130 @@
+"""Sensors that send one kind of message at scan rate, and a hub that takes them: what bandwidth is measured on.
+
+    python -m benchmarks.traffic hub ADDRESS SENSORS
+    python -m benchmarks.traffic sensor WORLD NAME KIND ADDRESS
+
+Messages, codec, keys and the settings of the network are the product's; kinds are ``reports``, ``proposals`` and
+``plots``, the last as a centralised tracker needs them: none may be lost. A sensor is told on standard input at which
+nanosecond of the monotonic clock to start, and says how large its payloads were.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from benchmarks.worlds import World
+from common.codec import encode
+from common.config import Network
+from common.messages import Join, Keys, Message, Proposal, Scan, Start
+from common.transport import open_zenoh
+from fusion_center.center import Center
+from sensor_node.tracker import LocalTracker
+
+PORT = 7447
+#: Plots this far from every target are no track's.
+_UNCLAIMED_M = 300.0
+_KEYS = Keys("bench")
+
+
+def messages(world: World, name: str, kind: str) -> Iterator[Message]:
+    """What a sensor of a world sends, one message a scan."""
+    scans = world.seen_by(name)
+    if kind == "plots":
+        yield from scans
+    elif kind == "proposals":
+        yield from (_proposal(world, name, scan) for scan in scans)
+    else:
+        yield from _reports(world, name, scans)
+
+
+def _reports(world: World, name: str, scans: list[Scan]) -> Iterator[Message]:
+    scenario = world.scenario()
+    tracker, center = LocalTracker.of(scenario, name), Center.of(scenario)
+    _, answers = center.step(center.initial(), Join(name, 1, scans[0].time_ns, center.digest), 0)
+    state = tracker.initial()
+    for answer in answers:
+        if isinstance(answer, Start):
+            state = tracker.start(state, answer)
+    for scan in scans:
+        state, report = tracker.scan(state, scan, scan.time_ns + round(1e9 * world.interval_s))
+        yield report
+
+
+def _proposal(world: World, name: str, scan: Scan) -> Proposal:
+    """One new track for every plot that no target explains."""
+    states = world.states()
+    time_s = world.scenario().to_seconds(scan.time_ns)
+    distances, _ = KDTree(states[:, :2] + time_s * states[:, 2:]).query(scan.z)
+    z = scan.z[distances > _UNCLAIMED_M]
+    x = np.concatenate([z, np.zeros_like(z)], axis=-1)
+    return Proposal(name, scan.time_ns, x, np.repeat(np.diag([2500.0, 2500.0, 400.0, 400.0])[None], len(z), axis=0))
+
+
+def sensor(world: World, name: str, kind: str, address: str) -> None:
+    """Send all messages of one kind, one an interval."""
+    payloads, key = [], ""
+    for message in messages(world, name, kind):
+        key = _KEYS.of(message)
+        payloads.append(encode(message, rounded=world.precision == "float32"))
+    with open_zenoh(Network(name="bench", connect=(f"tcp/{address}:{PORT}",))) as bus:
+        here = threading.Event()
+        bus.watch(_KEYS.center_alive(), lambda *_: here.set())
+        publisher = bus.publisher(key)
+        bus.announce(_KEYS.sensor_alive(name))
+        here.wait()
+        print(json.dumps([len(payload) for payload in payloads]), flush=True)
+        start_ns = int(sys.stdin.readline())
+        for number, payload in enumerate(payloads):
+            time.sleep(max(0, start_ns + round(number * 1e9 * world.interval_s) - time.monotonic_ns()) / 1e9)
+            publisher.put(payload)
+        sys.stdin.read()
+
+
+def hub(address: str, sensors: int) -> None:
+    """Take what the sensors send; tell how much came and was lost when standard input says a line."""
+    counts = {"came": 0, "lost": 0}
+    there: set[str] = set()
+    complete = threading.Event()
+
+    def came(key: str, payload: bytes) -> None:  # noqa: ARG001
+        counts["came"] += 1
+
+    def missed(key: str, number: int) -> None:  # noqa: ARG001
+        counts["lost"] += number
+
+    def present(key: str, alive: bool) -> None:
+        if alive:
+            there.add(key)
+        if len(there) == sensors:
+            complete.set()
+
+    with open_zenoh(Network(name="bench", listen=(f"tcp/{address}:{PORT}",))) as bus:
+        for key in (_KEYS.report(), _KEYS.proposal(), _KEYS.plots()):
+            bus.subscribe(key, came, on_miss=missed)
+        bus.watch(_KEYS.sensor_alive(), present)
+        bus.announce(_KEYS.center_alive())
+        print(json.dumps("listening"), flush=True)
+        complete.wait()
+        print(json.dumps("complete"), flush=True)
+        for _ in sys.stdin:
+            print(json.dumps(counts), flush=True)
+
+
+def main() -> None:
+    """Play the part that the command line names."""
+    role, *rest = sys.argv[1:]
+    if role == "hub":
+        hub(rest[0], int(rest[1]))
+    else:
+        sensor(World.of(rest[0]), *rest[1:])
+
+
+if __name__ == "__main__":
+    main()

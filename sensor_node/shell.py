@@ -81,9 +81,12 @@ class NodeShell:
         while not self._stopped and not self._done():
             now = time.time_ns()
             due = self._due_ns()
-            if self._inbox.empty and due is not None and due <= now:
-                self._process(self._scans[self._position])
-                continue
+            if self._inbox.empty and due is not None:
+                scan = self._scans[self._position]
+                if due <= now:
+                    self._process(scan)
+                    continue
+                self._state = self._tracker.prepare(self._state, scan.time_ns, scan.position)
             self._handle(self._inbox.receive(self._wake_ns(due)))
         self._log.info("ended", scans=self._position, of=len(self._scans), dropped=dict(self.complaints.counts))
 

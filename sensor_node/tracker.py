@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 
 from common.config import Scenario, SensorConfig
-from common.estimation.association import Clutter, Plots, pdaf, tight
+from common.estimation.association import Clutter, Expected, Plots, expect, pdaf, update
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, Gaussian
+from common.estimation.gaussian import Array, BoolArray, Gaussian
 from common.estimation.motion import Motion
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
@@ -52,6 +52,33 @@ class Tracks(NamedTuple):
     network_P: Array
 
 
+class Ready(NamedTuple):
+    """All of the next scan that its plots do not change.
+
+    Attributes:
+        tracks, advice: of the state that it was worked out from; it is of use as long as these are the same.
+        time_ns, position: of the scan.
+        advised: all tracks, advice followed.
+        live: which of them started before the scan.
+        predicted: those, at the time of the scan.
+        expected: those, as the sensor will see them.
+    """
+
+    tracks: Tracks
+    advice: tuple[Advice, ...]
+    time_ns: int
+    position: Array
+    advised: Tracks
+    live: BoolArray
+    predicted: Tracks
+    expected: Expected
+
+    def fits(self, state: State, time_ns: int, position: Array) -> bool:
+        """Whether it was worked out from the tracks and advice of a state, for the scan of that time and position."""
+        same_state = self.tracks is state.tracks and self.advice is state.advice
+        return same_state and self.time_ns == time_ns and np.array_equal(self.position, position)
+
+
 class State(NamedTuple):
     """State of a node.
 
@@ -61,6 +88,7 @@ class State(NamedTuple):
         tracks: the tracks.
         recent: scans of the last few seconds, oldest first, for tracks and advice that come late.
         advice: not followed yet, oldest first.
+        ready: worked out ahead for the next scan, or None. It saves time and changes nothing.
     """
 
     epoch: int
@@ -68,6 +96,7 @@ class State(NamedTuple):
     tracks: Tracks
     recent: tuple[Scan, ...]
     advice: tuple[Advice, ...] = ()
+    ready: Ready | None = None
 
 
 class Schedule(NamedTuple):
@@ -154,12 +183,16 @@ class LocalTracker:
         tracks = Tracks(none, none, np.empty(0), x, P, none, x, P, np.empty((0, network, n, n)))
         return State(epoch=0, sequence=0, tracks=tracks, recent=())
 
+    def prepare(self, state: State, time_ns: int, position: Array) -> State:
+        """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
+        return state._replace(ready=self._ready(state, time_ns, position))
+
     def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report]:
         """Filter one scan and report every track that started before it."""
-        state = self._follow_advice(state, scan.time_ns)
-        live = state.tracks.times_ns < scan.time_ns
-        filtered = self._filter(take(state.tracks, live), scan)
-        tracks = filtered if live.all() else put(state.tracks, live, filtered)
+        ready = self._ready(state, scan.time_ns, scan.position)
+        filtered = self._update(ready.predicted, ready.expected, scan)
+        tracks = filtered if ready.live.all() else put(ready.advised, ready.live, filtered)
+        advice = tuple(later for later in state.advice if later.time_ns >= scan.time_ns)
         kept = tuple(old for old in state.recent if old.time_ns >= scan.time_ns - self.buffer_ns)
         x, P = filtered.x, filtered.P
         if self.rounded:
@@ -176,7 +209,7 @@ class LocalTracker:
             x=x,
             P=P,
         )
-        return State(state.epoch, state.sequence + 1, tracks, (*kept, scan), state.advice), report
+        return State(state.epoch, state.sequence + 1, tracks, (*kept, scan), advice), report
 
     def start(self, state: State, start: Start) -> State:
         """Take over tracks, and catch up on the scans since their start; a higher epoch names all tracks there are."""
@@ -199,16 +232,25 @@ class LocalTracker:
         """Keep advice for the next scan after its time (theory.md §6)."""
         return state._replace(advice=(*state.advice, advice))
 
-    def _follow_advice(self, state: State, t_ns: int) -> State:
+    def _ready(self, state: State, time_ns: int, position: Array) -> Ready:
+        """What the scan of a time needs: as it was prepared, where that still holds."""
+        ready = state.ready
+        if ready is not None and ready.fits(state, time_ns, position):
+            return ready
+        advised = self._follow_advice(state, time_ns)
+        live = advised.times_ns < time_ns
+        predicted, expected = self._expect(take(advised, live), time_ns, position)
+        return Ready(state.tracks, state.advice, time_ns, position, advised, live, predicted, expected)
+
+    def _follow_advice(self, state: State, t_ns: int) -> Tracks:
         """Set the association filters to the newest fused tracks from before ``t_ns`` and redo the scans since.
 
         The factors never see the advice: nothing is counted twice. Advice may be from ahead of a slow node; it waits.
         """
         past = [advice for advice in state.advice if advice.time_ns < t_ns]
         if not past:
-            return state
+            return state.tracks
         advice = sorted(past, key=lambda advice: advice.time_ns)[-1]  # of one time the one that came last
-        state = state._replace(advice=tuple(later for later in state.advice if later.time_ns >= t_ns))
         tracks = state.tracks
         _, mine, given = np.intersect1d(tracks.ids, advice.ids, assume_unique=True, return_indices=True)
         x_a, P_a, times = tracks.x_a.copy(), tracks.P_a.copy(), tracks.times_a_ns.copy()
@@ -220,9 +262,9 @@ class LocalTracker:
                     Gaussian(x_a[due], P_a[due]), self.motion, _interval(times[due], scan.time_ns)
                 )
                 linear = self.sensor.measurement.linearise(predicted.x, scan.position)
-                filtered = pdaf(predicted, _plots(scan), linear, self._clutter(predicted, scan))
+                filtered = pdaf(predicted, Plots(scan.z), linear, self._clutter(predicted, scan.position))
                 (x_a[due], P_a[due]), times[due] = filtered.density, scan.time_ns
-        return state._replace(tracks=tracks._replace(x_a=x_a, P_a=P_a, times_a_ns=times))
+        return tracks._replace(x_a=x_a, P_a=P_a, times_a_ns=times)
 
     def _fresh(self, start: Start, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Tracks:
         network = len(self.sensors) if self.schedule else 0
@@ -242,23 +284,29 @@ class LocalTracker:
 
     def _filter(self, tracks: Tracks, scan: Scan) -> Tracks:
         """Predict to the scan and filter it."""
-        factor, network_P = self._predict_factors(tracks, scan.time_ns)
-        linear = self.sensor.measurement.linearise(factor.x, scan.position)
-        association = Gaussian(tracks.x_a, tracks.P_a)
-        if self.tight:
-            association = HONEST.predict(association, self.motion, _interval(tracks.times_a_ns, scan.time_ns))
-            linear_a = self.sensor.measurement.linearise(association.x, scan.position)
-            clutter = self._clutter(association, scan)
-            filtered, association = tight(factor, association, _plots(scan), (linear, linear_a), clutter)
-        else:
-            filtered = pdaf(factor, _plots(scan), linear, self._clutter(factor, scan))
-        now = np.full_like(tracks.times_ns, scan.time_ns)
-        log_p_bar = tracks.log_p_bar + filtered.log_p_bar
-        return Tracks(tracks.ids, now, log_p_bar, *filtered.density, now, *association, network_P)
+        return self._update(*self._expect(tracks, scan.time_ns, scan.position), scan)
 
-    def _clutter(self, density: Gaussian, scan: Scan) -> Clutter:
-        center = self.config.view_center(scan.position)
-        p_d = self.sensor.detection_probability(density, center)
+    def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Expected]:
+        """Predict to a time, and what the sensor will see from a position then."""
+        now = np.full_like(tracks.times_ns, time_ns)
+        factor, network_P = self._predict_factors(tracks, time_ns)
+        filters, association = [factor], Gaussian(tracks.x_a, tracks.P_a)
+        if self.tight:
+            association = HONEST.predict(association, self.motion, _interval(tracks.times_a_ns, time_ns))
+            filters.append(association)
+        both = Gaussian(*(np.stack(arrays) for arrays in zip(*filters, strict=True)))
+        linear = self.sensor.measurement.linearise(both.x, position)
+        predicted = Tracks(tracks.ids, now, tracks.log_p_bar, *factor, now, *association, network_P)
+        return predicted, expect(both, linear, self._clutter(filters[-1], position))
+
+    def _update(self, predicted: Tracks, expected: Expected, scan: Scan) -> Tracks:
+        """Filter a scan."""
+        (x, P), log_p_bar = update(expected, Plots(scan.z))
+        tracks = predicted._replace(log_p_bar=predicted.log_p_bar + log_p_bar, x=x[0], P=P[0])
+        return tracks._replace(x_a=x[1], P_a=P[1]) if self.tight else tracks
+
+    def _clutter(self, density: Gaussian, position: Array) -> Clutter:
+        p_d = self.sensor.detection_probability(density, self.config.view_center(position))
         return Clutter(p_d, np.array(self.sensor.log_rho_f), self.gate_probability)
 
     def _predict_factors(self, tracks: Tracks, t_ns: int) -> tuple[Gaussian, Array]:
@@ -292,7 +340,3 @@ def _interval(times_ns: IntArray, t_ns: int) -> Array:
     """Seconds from ``times_ns`` to ``t_ns``, shape (T,); () when all are equal, which makes F one matrix for all."""
     dt: Array = (t_ns - times_ns) / NS_PER_S
     return dt[0, ...] if len(dt) and (dt == dt[0]).all() else dt
-
-
-def _plots(scan: Scan) -> Plots:
-    return Plots(scan.z, np.ones(len(scan.z), np.bool_))

@@ -1,8 +1,11 @@
 """Plots and tracks: gate, PDAF update with its weight sum, tight association.
 
+A scan has two halves. What its plots do not change, most of the matrices, is worked out by ``expect`` as soon as the
+time of the scan is known; ``update`` is what is left to do when the plots are there.
+
 Everything is done in whitened coordinates: with ``S_k = L L'``, ``w_j = L^-1 nu_j`` and ``W = P H' L^-T`` the gain
-times an innovation is ``K nu = W w`` and ``K S_k K' = W W'``, so that Eq. (7) needs neither K nor S_k. The difference
-``P - K S_k K'`` is computed in Joseph's form: as it stands it loses all digits where a sharp plot meets a wide prior.
+times an innovation is ``K nu = W w`` and ``K S_k K' = W W'``, so that Eq. (7) is the covariance after a plot that is
+surely the target's, plus ``W (p_0 I + spread of the w_j) W'``: sums of positive semidefinite terms only.
 """
 
 from __future__ import annotations
@@ -18,15 +21,16 @@ from common.estimation.gaussian import (
     Array,
     BoolArray,
     Gaussian,
-    cholesky,
-    half_log_det,
-    log_sum_exp,
-    squared_norm,
+    identity,
+    joseph,
     symmetric,
     times_transposed,
-    whiten,
+    whitener,
 )
 from common.estimation.sensing import Linearised
+
+#: Of what can be compared: the greatest of impossible weights is not -inf.
+_LOWEST = float(np.finfo(np.float64).min)
 
 
 class Plots(NamedTuple):
@@ -34,11 +38,11 @@ class Plots(NamedTuple):
 
     Attributes:
         z: shape (..., M, m).
-        valid: shape (..., M); false marks padding.
+        valid: shape (..., M); false marks padding. None: there is none.
     """
 
     z: Array
-    valid: BoolArray
+    valid: BoolArray | None = None
 
 
 class Clutter(NamedTuple):
@@ -55,31 +59,40 @@ class Clutter(NamedTuple):
     p_g: float
 
 
-class Innovations(NamedTuple):
-    """All plots of a scan seen from a predicted track.
+class Expected(NamedTuple):
+    """Predicted tracks as a sensor will see them.
+
+    The filters of a track stand on the first axis: one, or its factor and its association filter. The last one says
+    which plot is whose.
 
     Attributes:
-        w: whitened innovations, shape (..., M, m).
-        W: whitened gain, shape (..., n, m).
-        J: whitened Jacobian L^-1 H, shape (..., m, n).
-        M: whitened measurement noise L^-1 R L^-T, shape (..., m, m).
-        distance: squared Mahalanobis distances, shape (..., M).
-        log_pdf: log N(z_j; z_hat, S_k), shape (..., M).
+        density: the predicted Gaussians, shapes (F, ..., n), (F, ..., n, n).
+        z: expected plots, shape (F, ..., m).
+        whitener: L^-1 of ``S_k = L L'``, shape (F, ..., m, m).
+        W: whitened gains, shape (F, ..., n, m).
+        P_hit: covariances after a plot that is surely the target's, shape (F, ..., n, n).
+        log_peak: log N(z; z, S_k), shape (F, ...).
+        log_miss: log p*_0 (Eq. 6), shape (...).
+        log_hit: log (p_d / rho_f), shape (...).
+        gate: squared Mahalanobis distance up to which a plot counts.
     """
 
-    w: Array
+    density: Gaussian
+    z: Array
+    whitener: Array
     W: Array
-    J: Array
-    M: Array
-    distance: Array
-    log_pdf: Array
+    P_hit: Array
+    log_peak: Array
+    log_miss: Array
+    log_hit: Array
+    gate: float
 
 
 class Filtered(NamedTuple):
-    """A track after a scan.
+    """Tracks after a scan.
 
     Attributes:
-        density: the posterior Gaussian.
+        density: the posterior Gaussians.
         log_p_bar: logarithm of the weight sum, shape (...).
     """
 
@@ -87,29 +100,59 @@ class Filtered(NamedTuple):
     log_p_bar: Array
 
 
-def innovate(predicted: Gaussian, z: Array, sensor: Linearised) -> Innovations:
-    """Innovations of all plots against predicted tracks.
+def expect(predicted: Gaussian, sensor: Linearised, clutter: Clutter) -> Expected:
+    """Work out all of a scan that its plots do not change.
 
     Args:
-        predicted: shapes (..., n), (..., n, n).
-        z: plots, shape (..., M, m), batch axes broadcast against those of ``predicted``.
+        predicted: one or two filters of every track, shapes (F, ..., n), (F, ..., n, n).
         sensor: the measurement function linearised at ``predicted.x``.
+        clutter: detection probability, false plots, gate: one for all filters of a track, because whether the sensor
+            sees the target is for the honest density to say, not for a factor that is n_sensors times too wide.
 
     Returns:
-        the innovations.
+        what ``update`` needs.
     """
     PH = times_transposed(predicted.P, sensor.H)
-    L = cholesky(symmetric(times_transposed(PH.mT, sensor.H)) + sensor.R)
-    L_plot = L[..., None, :, :]
-    w = whiten(L_plot, z - sensor.z[..., None, :])
-    distance = squared_norm(w)
-    log_pdf = -0.5 * distance - half_log_det(L)[..., None] - 0.5 * LOG_2PI * L.shape[-1]
-    n, m = PH.shape[-2:]
-    right = np.empty((*PH.shape[:-2], 2 * n + m, m))
-    right[..., :n, :], right[..., n : 2 * n, :], right[..., 2 * n :, :] = PH, sensor.H.mT, sensor.R
-    right = whiten(L_plot, right)
-    W, J, M = right[..., :n, :], right[..., n : 2 * n, :].mT, right[..., 2 * n :, :].mT
-    return Innovations(w, W, J, whiten(L_plot, M), distance, log_pdf)
+    white, half_log_det = whitener(symmetric(times_transposed(PH.mT, sensor.H)) + sensor.R)
+    m = white.shape[-1]
+    W = PH @ white.mT
+    return Expected(
+        density=predicted,
+        z=sensor.z,
+        whitener=white,
+        W=W,
+        P_hit=joseph(predicted.P, W @ white, sensor.H, sensor.R),
+        log_peak=-half_log_det - 0.5 * LOG_2PI * m,
+        log_miss=_log(1.0 - clutter.p_d * clutter.p_g),
+        log_hit=_log(clutter.p_d) - clutter.log_rho_f,
+        gate=gate_threshold(clutter.p_g, m),
+    )
+
+
+def update(expected: Expected, plots: Plots) -> Filtered:
+    """Filter one scan (Eq. 6, 7; with two filters Eq. 12, 13).
+
+    Args:
+        expected: tracks, predicted to the time of the scan.
+        plots: of the scan; no plots is evidence too.
+
+    Returns:
+        posteriors of all filters, shapes (F, ..., n), (F, ..., n, n), and log p_bar of the first, shape (...).
+    """
+    nu = plots.z - expected.z[..., None, :]
+    if plots.valid is not None:
+        # Padding may hold anything, and 0 times NaN is no zero.
+        nu = np.where(plots.valid[..., None], nu, 0.0)
+    w = nu @ expected.whitener.mT
+    distance = np.vecdot(w, w)
+    log_pdf = expected.log_peak[..., None] - 0.5 * distance
+    inside = distance[-1] <= expected.gate
+    if plots.valid is not None:
+        inside &= plots.valid
+    q, log_q_bar = normalise(log_weights(expected, log_pdf[-1], inside))
+    # Eq. (13): with log q_j = log (weight j) - log q_bar, only the densities of the plots do not cancel.
+    log_p_bar = log_q_bar + np.vecdot(q[..., 1:], log_pdf[0] - log_pdf[-1])
+    return Filtered(absorb(expected, w, q), log_p_bar)
 
 
 @cache
@@ -118,27 +161,20 @@ def gate_threshold(p_g: float, m: int) -> float:
     return float(2.0 * gammaincinv(m / 2.0, p_g))
 
 
-def gate(innovations: Innovations, valid: BoolArray, p_g: float) -> BoolArray:
-    """Which plots lie inside the gate (chi-square test), shape (..., M)."""
-    return valid & (innovations.distance <= gate_threshold(p_g, innovations.w.shape[-1]))
-
-
-def log_weights(innovations: Innovations, inside: BoolArray, clutter: Clutter) -> Array:
+def log_weights(expected: Expected, log_pdf: Array, inside: BoolArray) -> Array:
     """Logarithms of the unnormalised weights p*_j (Eq. 6), j = 0 the missed detection.
 
     Args:
-        innovations: of M plots.
+        expected: the tracks.
+        log_pdf: log N(z_j; H x, S_k) of the filter that associates, shape (..., M).
         inside: plots that count, shape (..., M).
-        clutter: detection probability, false plots, gate.
 
     Returns:
         log p*_j, shape (..., 1 + M); -inf for impossible hypotheses.
     """
-    miss = _log(1.0 - clutter.p_d * clutter.p_g)
-    plot = (_log(clutter.p_d) - clutter.log_rho_f)[..., None] + innovations.log_pdf
-    weights = np.empty((*plot.shape[:-1], 1 + plot.shape[-1]))
-    weights[..., 0] = miss
-    weights[..., 1:] = np.where(inside, plot, -np.inf)
+    weights = np.empty((*log_pdf.shape[:-1], 1 + log_pdf.shape[-1]))
+    weights[..., 0] = expected.log_miss
+    weights[..., 1:] = np.where(inside, expected.log_hit[..., None] + log_pdf, -np.inf)
     return weights
 
 
@@ -149,34 +185,33 @@ def normalise(log_p_star: Array) -> tuple[Array, Array]:
         p_j, shape (..., 1 + M), and log p_bar, shape (...). A scan that h1 holds for impossible (p_d = 1 and no plot in
         the gate) gives log p_bar = -inf and, as nothing can be learnt from it, p_0 = 1.
     """
-    log_p_bar = log_sum_exp(log_p_star)
-    possible = np.isfinite(log_p_bar)
-    p = np.exp(log_p_star - np.where(possible, log_p_bar, 0.0)[..., None])
-    p[..., 0] += ~possible
-    return p, log_p_bar
+    top = log_p_star.max(axis=-1, keepdims=True, initial=_LOWEST)
+    p = np.exp(log_p_star - top)
+    p_bar = p.sum(axis=-1, keepdims=True)
+    impossible = p_bar == 0.0
+    p_bar += impossible
+    p /= p_bar
+    p[..., :1] += impossible
+    return p, np.where(impossible, -np.inf, top + np.log(p_bar))[..., 0]
 
 
-def absorb(predicted: Gaussian, innovations: Innovations, p: Array) -> Gaussian:
+def absorb(expected: Expected, w: Array, p: Array) -> Gaussian:
     """Moment-matched update with given association weights (Eq. 7).
 
     Args:
-        predicted: shapes (..., n), (..., n, n).
-        innovations: of M plots.
+        expected: the tracks.
+        w: whitened innovations, shape (F, ..., M, m).
         p: weights, shape (..., 1 + M), sum one, p[..., 0] the missed detection.
 
     Returns:
         the posterior Gaussians.
     """
-    w, W, hit = innovations.w, innovations.W, p[..., 1:]
-    # Padding may hold anything, and 0 times NaN is no zero.
-    w = np.where(hit[..., None] > 0.0, w, 0.0)
-    weighted = hit[..., None] * w
+    W, hit = expected.W, p[..., 1:]
     mean = np.vecmat(hit, w)
-    spread = weighted.mT @ w - mean[..., :, None] * mean[..., None, :]
-    # Joseph's form: P - W W' = A P A' + W M W', every term positive semidefinite.
-    A = np.eye(W.shape[-2]) - W @ innovations.J
-    rest = innovations.M + p[..., 0, None, None] * np.eye(w.shape[-1]) + spread
-    return Gaussian(predicted.x + np.matvec(W, mean), symmetric(A @ predicted.P @ A.mT + W @ rest @ W.mT))
+    rest = (hit[..., None] * w).mT @ w - mean[..., :, None] * mean[..., None, :]
+    rest += p[..., 0, None, None] * identity(w.shape[-1])
+    x = expected.density.x + np.matvec(W, mean)
+    return Gaussian(x, expected.P_hit + symmetric(W @ rest @ W.mT))
 
 
 def pdaf(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter) -> Filtered:
@@ -194,19 +229,15 @@ def pdaf(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter
     References:
         theory.md Eq. (6), (7); Bar-Shalom, Daum & Huang, The probabilistic data association filter (2009).
     """
-    innovations = innovate(predicted, plots.z, sensor)
-    inside = gate(innovations, plots.valid, clutter.p_g)
-    p, log_p_bar = normalise(log_weights(innovations, inside, clutter))
-    return Filtered(absorb(predicted, innovations, p), log_p_bar)
+    one = Gaussian(predicted.x[None], predicted.P[None])
+    density, log_p_bar = update(expect(one, sensor._replace(z=sensor.z[None]), clutter), plots)
+    return Filtered(Gaussian(density.x[0], density.P[0]), log_p_bar)
 
 
 def tight(
     factor: Gaussian, association: Gaussian, plots: Plots, sensors: tuple[Linearised, Linearised], clutter: Clutter
 ) -> tuple[Filtered, Gaussian]:
     """One scan with tight association (Eq. 12, 13): the association filter alone decides who is who.
-
-    The detection probability in ``clutter`` is one number for both filters: whether the sensor sees the target is for
-    the honest density to say, not for the factor, which is n_sensors times too wide.
 
     Args:
         factor: predicted factors, shapes (..., n), (..., n, n).
@@ -218,15 +249,14 @@ def tight(
     Returns:
         the factor with its log p_bar (Eq. 13), and the association filter.
     """
-    seen_by_factor = innovate(factor, plots.z, sensors[0])
-    seen = innovate(association, plots.z, sensors[1])
-    inside = gate(seen, plots.valid, clutter.p_g)
-    q, log_q_bar = normalise(log_weights(seen, inside, clutter))
-    log_p_star = log_weights(seen_by_factor, inside, clutter)
-    # q log q -> 0 for q -> 0; an impossible scan stays impossible.
-    terms = np.where(q > 0.0, q * (np.where(q > 0.0, log_p_star, 0.0) - _log(np.where(q > 0.0, q, 1.0))), 0.0)
-    log_p_bar = np.where(np.isfinite(log_q_bar), terms.sum(axis=-1), -np.inf)
-    return Filtered(absorb(factor, seen_by_factor, q), log_p_bar), absorb(association, seen, q)
+    both = Gaussian(np.stack([factor.x, association.x]), np.stack([factor.P, association.P]))
+    batch = factor.x.shape[:-1]
+    z, H, R = (
+        np.stack([np.broadcast_to(a, (*batch, *a.shape[-d:])) for a in pair])
+        for pair, d in zip(zip(*sensors, strict=True), (1, 2, 2), strict=True)
+    )
+    density, log_p_bar = update(expect(both, Linearised(z, H, R), clutter), plots)
+    return Filtered(Gaussian(density.x[0], density.P[0]), log_p_bar), Gaussian(density.x[1], density.P[1])
 
 
 def _log(value: Array) -> Array:

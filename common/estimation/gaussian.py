@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -37,20 +38,35 @@ class Product(NamedTuple):
     log_c: Array
 
 
+@cache
+def identity(n: int) -> Array:
+    """The identity of size ``n``, to read only."""
+    eye = np.eye(n)
+    eye.flags.writeable = False
+    return eye
+
+
 def symmetric(P: Array) -> Array:
     """Return the symmetric part of ``P``, shape (..., n, n): rounding never adds up to a skew."""
     return 0.5 * (P + P.mT)
 
 
 def times_transposed(P: Array, A: Array) -> Array:
-    """``P A'``, shapes (..., n, n) and (m, n) or (..., m, n) to (..., n, m).
+    """``P A'``, shapes (..., k, n) and (m, n) or (..., m, n) to (..., k, m).
 
     A matrix that the whole batch shares takes one product; NumPy would do as many small ones as there are batches.
     """
     if A.ndim > 2:
         return P @ A.mT
-    n = P.shape[-1]
-    return (P.reshape(-1, n) @ A.T).reshape(*P.shape[:-1], len(A))
+    return (P.reshape(-1, P.shape[-1]) @ A.T).reshape(*P.shape[:-1], len(A))
+
+
+def gram(W: Array) -> Array:
+    """``W'W``, shape (..., k, n) to (..., n, n).
+
+    NumPy takes products with a transposed matrix slowly, so that a copy of it pays.
+    """
+    return np.ascontiguousarray(W.mT) @ W
 
 
 def squared_norm(w: Array) -> Array:
@@ -102,6 +118,56 @@ def half_log_det(L: Array) -> Array:
     return np.log(determinant)
 
 
+def whitener(P: Array) -> tuple[Array, Array]:
+    """Inverse Cholesky factors ``L^-1`` of ``P = L L'``, and ``0.5 log det P``.
+
+    Gaussian elimination of ``[P | I]``, without pivots as P is positive definite, leaves ``D L'`` on the left and
+    the whitener on the right, up to the roots of the pivots. The batch is the last axis meanwhile: a step of the
+    elimination is then a handful of operations on long rows, for one matrix and for thousands.
+
+    Args:
+        P: shape (..., n, n).
+
+    Returns:
+        ``L^-1``, lower triangular, shape (..., n, n), and ``0.5 log det P``, shape (...).
+
+    Raises:
+        numpy.linalg.LinAlgError: when a matrix is not positive definite.
+    """
+    n = P.shape[-1]
+    A = np.empty((n, 2 * n, P.size // (n * n)))
+    A[:, :n], A[:, n:] = P.reshape(-1, n, n).T, identity(n)[..., None]
+    for k in range(n - 1):
+        # Columns before these are done, and those after them still zero.
+        active = slice(k + 1, n + k + 1)
+        rest = A[k + 1 :, active]
+        rest -= A[k + 1 :, k, None] * (A[k, active] / A[k, k])
+    pivots = A.diagonal()
+    if not pivots.min(initial=1.0) > 0.0:
+        raise np.linalg.LinAlgError("a matrix is not positive definite")
+    W = np.empty((pivots.shape[0], n, n))
+    np.divide(A[:, n:], np.sqrt(pivots.T)[:, None], out=W.transpose(1, 2, 0))
+    return W.reshape(P.shape), 0.5 * np.log(pivots).sum(axis=-1).reshape(P.shape[:-2])
+
+
+def joseph(P: Array, K: Array, H: Array, R: Array) -> Array:
+    """Covariance of a Kalman update, ``(I - K H) P (I - K H)' + K R K'``.
+
+    As it stands in textbooks, ``P - K S_k K'`` loses all digits where a sharp plot meets a wide prior.
+
+    Args:
+        P: predicted covariances, shape (..., n, n).
+        K: gains, shape (..., n, m).
+        H: measurement matrix, shape (m, n) or (..., m, n).
+        R: measurement noise, shape (m, m) or (..., m, m).
+
+    Returns:
+        updated covariances, shape (..., n, n).
+    """
+    A = identity(P.shape[-1]) - times_transposed(K, H.mT)
+    return symmetric(A @ P @ A.mT + times_transposed(K, R) @ K.mT)
+
+
 def log_pdf(at: Array, density: Gaussian) -> Array:
     """Logarithm of ``N(at; x, P)``.
 
@@ -139,26 +205,21 @@ def product(factors: Gaussian, members: BoolArray | None = None) -> Product:
         theory.md Eq. (8), (9); N. Carlson, Federated square root filter (1990).
     """
     *batch, n_sensors, n = factors.x.shape
-    L = cholesky(factors.P)
-    # Rows of W: the columns of L^-1, so that P^-1 = W W'; side by side they make the sum over the sensors one product.
-    W = whiten(L[..., None, :, :], np.eye(n))
+    W, half = whitener(factors.P)
+    half += 0.5 * LOG_2PI * n
     if members is not None:
-        W = W * members[..., None, None]
-    side_by_side = np.swapaxes(W, -3, -2).reshape(*batch, n, n_sensors * n)
-    information = side_by_side @ side_by_side.mT
+        W, half = W * members[..., None, None], half * members
+    # P^-1 = W'W: with the rows of all sensors one below the other, the sum over them is one product.
+    rows = W.reshape(*batch, n_sensors * n, n)
+    V, half_information = whitener(gram(rows))
+    P = gram(V)
     # Relative to the first factor, so that large coordinates cost no digits.
     reference = factors.x[..., :1, :]
-    v = np.matvec(side_by_side, whiten(L, factors.x - reference).reshape(*batch, n_sensors * n))
-    C = cholesky(information)
-    V = whiten(C[..., None, :, :], np.eye(n))
-    P = V @ V.mT
-    x = reference[..., 0, :] + np.matvec(P, v)
-    w = whiten(L, x[..., None, :] - factors.x)
-    terms = -0.5 * squared_norm(w) - half_log_det(L) - 0.5 * LOG_2PI * n
-    if members is not None:
-        terms = np.where(members, terms, 0.0)
-    log_c = terms.sum(axis=-1) - half_log_det(C) + 0.5 * LOG_2PI * n
-    return Product(Gaussian(x, P), log_c)
+    u = np.matvec(W, factors.x - reference).reshape(*batch, n_sensors * n)
+    shift = np.matvec(P, np.vecmat(u, rows))
+    w = np.matvec(rows, shift) - u
+    log_c = -0.5 * np.vecdot(w, w) - half.sum(axis=-1) - half_information + 0.5 * LOG_2PI * n
+    return Product(Gaussian(reference[..., 0, :] + shift, P), log_c)
 
 
 def moments(weights: Array, components: Gaussian) -> Gaussian:

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from common.estimation.gaussian import Array, Gaussian, symmetric, times_transposed
+from common.estimation.gaussian import Array, Gaussian, identity, symmetric, times_transposed
 
 
 class Motion(Protocol):
@@ -54,25 +54,19 @@ class ConstantVelocity(NamedTuple):
 
     def transition(self, dt: Array) -> Array:
         """F over ``dt`` seconds, shape (...) to (..., n, n)."""
-        return _blocks(1.0, dt, 0.0, 1.0, dt.shape, self.dimensions)
+        return _blocks(np.ones_like(dt), dt, np.zeros_like(dt), np.ones_like(dt), self.dimensions)
 
     def noise(self, dt: Array) -> Array:
         """Q over ``dt`` seconds, shape (...) to (..., n, n)."""
         cross = self.psd * dt**2 / 2.0
-        return _blocks(self.psd * dt**3 / 3.0, cross, cross, self.psd * dt, dt.shape, self.dimensions)
+        return _blocks(self.psd * dt**3 / 3.0, cross, cross, self.psd * dt, self.dimensions)
 
 
-def _blocks(
-    a: Array | float, b: Array | float, c: Array | float, d: Array | float, batch: tuple[int, ...], size: int
-) -> Array:
+def _blocks(a: Array, b: Array, c: Array, d: Array, size: int) -> Array:
     """``[[a I, b I], [c I, d I]]`` with identities of ``size``, shape (...) to (..., 2 size, 2 size)."""
-    blocks = np.zeros((*batch, 2 * size, 2 * size))
-    for i in range(size):
-        blocks[..., i, i] = a
-        blocks[..., i, size + i] = b
-        blocks[..., size + i, i] = c
-        blocks[..., size + i, size + i] = d
-    return blocks
+    blocks = np.empty((*a.shape, 2, 1, 2, 1))
+    blocks[..., 0, 0, 0, 0], blocks[..., 0, 0, 1, 0], blocks[..., 1, 0, 0, 0], blocks[..., 1, 0, 1, 0] = a, b, c, d
+    return (blocks * identity(size)[:, None, :]).reshape(*a.shape, 2 * size, 2 * size)
 
 
 def predict(prior: Gaussian, F: Array, Q: Array) -> Gaussian:
@@ -88,4 +82,4 @@ def predict(prior: Gaussian, F: Array, Q: Array) -> Gaussian:
     """
     # (F P)' = P F', and the product with F once more gives F P F'.
     FP = times_transposed(prior.P, F).mT
-    return Gaussian(np.matvec(F, prior.x), symmetric(times_transposed(FP, F)) + Q)
+    return Gaussian(times_transposed(prior.x[..., None, :], F)[..., 0, :], symmetric(times_transposed(FP, F)) + Q)

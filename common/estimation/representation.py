@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numpy as np
-
-from common.estimation.gaussian import Array, Gaussian, cholesky, symmetric, whiten
+from common.estimation.gaussian import Array, Gaussian, gram, joseph, symmetric, times_transposed, whitener
 from common.estimation.motion import Motion, predict
 
 
@@ -64,11 +62,11 @@ def globalise(P: Array) -> Global:
     References:
         theory.md §4; F. Govaers, Sequential likelihood ratio test based on the distributed Kalman filter (2015).
     """
-    n_sensors, n = P.shape[-3], P.shape[-1]
-    W = whiten(cholesky(P)[..., None, :, :], np.eye(n))
-    information = W @ W.mT
-    V = whiten(cholesky(information.sum(axis=-3))[..., None, :, :], np.eye(n))
-    common = symmetric(n_sensors * (V @ V.mT))
+    n_sensors = P.shape[-3]
+    W, _ = whitener(P)
+    information = gram(W)
+    V, _ = whitener(information.sum(axis=-3))
+    common = symmetric(n_sensors * gram(V))
     return Global(common, common[..., None, :, :] @ information)
 
 
@@ -83,8 +81,6 @@ def shrink(P: Array, H: Array, R: Array) -> Array:
     Returns:
         updated covariances, shape (..., n, n).
     """
-    PH = P @ H.mT
-    L = cholesky(symmetric(H @ PH) + R)[..., None, :, :]
-    W = whiten(L, PH)
-    A = np.eye(P.shape[-1]) - W @ whiten(L, H.mT).mT
-    return symmetric(A @ P @ A.mT + W @ whiten(L, whiten(L, R).mT) @ W.mT)
+    PH = times_transposed(P, H)
+    W, _ = whitener(symmetric(times_transposed(PH.mT, H)) + R)
+    return joseph(P, PH @ gram(W), H, R)

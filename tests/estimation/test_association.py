@@ -25,7 +25,7 @@ from stonesoup.types.state import GaussianState
 from stonesoup.types.track import Track
 from stonesoup.updater.probability import PDAUpdater
 
-from common.estimation.association import Clutter, Filtered, Plots, absorb, gate_threshold, innovate, pdaf, tight
+from common.estimation.association import Clutter, Filtered, Plots, absorb, expect, gate_threshold, pdaf, tight
 from common.estimation.gaussian import Array, Gaussian
 from common.estimation.motion import ConstantVelocity, predict
 from common.estimation.representation import Share
@@ -459,7 +459,7 @@ def test_covariances_stay_symmetric_and_positive_definite() -> None:
 
 def test_absorbing_no_plot_leaves_everything(draw: Draw) -> None:
     predicted = draw(np.random.default_rng(12), (5,), 4)
-    innovations = innovate(predicted, np.zeros((5, 3, 2)), seen_by(predicted))
-    ours = absorb(predicted, innovations, np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)))
+    expected = expect(predicted, seen_by(predicted), clutter(0.5))
+    ours = absorb(expected, np.zeros((5, 3, 2)), np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)))
     np.testing.assert_array_equal(ours.x, predicted.x)
     np.testing.assert_allclose(ours.P, predicted.P, rtol=1e-12)

@@ -1,10 +1,13 @@
-"""Tests that need more than a plain machine are skipped where it is lacking, or fail where they must run."""
+"""What many tests share; those that need more than a plain machine are skipped where it is lacking."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
+from process_helpers import Processes
 
 from benchmarks.namespaces import Namespaces
 
@@ -16,3 +19,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     if "netns" in os.environ.get("WALDNET_MUST_RUN", ""):
         pytest.fail(f"network namespaces need {lacking}")
     pytest.skip(f"network namespaces need {lacking}")
+
+
+@pytest.fixture
+def processes(tmp_path: Path) -> Iterator[Processes]:
+    """Real processes in a folder of their own, none of which outlives the test."""
+    with Processes(tmp_path) as started:
+        yield started

@@ -71,12 +71,6 @@ LONG = (
 )
 
 
-@pytest.fixture
-def processes(tmp_path: Path) -> Iterator[Processes]:
-    with Processes(tmp_path) as started:
-        yield started
-
-
 class Ran(NamedTuple):
     """A run that has ended."""
 

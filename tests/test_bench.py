@@ -1,0 +1,116 @@
+"""The benchmarks measure what they say, and write what others read; how fast it is, no test asks."""
+
+from __future__ import annotations
+
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from builders import scenario
+from process_helpers import Processes
+
+from benchmarks.bandwidth import draw, table
+from benchmarks.precision import compare
+from benchmarks.traffic import messages
+from benchmarks.worlds import World
+from common.messages import Proposal, Report, Scan
+from sensor_node.sources import all_scans
+from studies.network import run_in_memory
+from studies.replay import Replay
+
+SMALL = World(tracks=7, sensors=2, false_plots=3.0, interval_s=0.5, scans=4)
+
+
+def rows_of(path: Path) -> list[dict[str, Any]]:
+    rows: list[dict[str, Any]] = json.loads(path.read_text())
+    return rows
+
+
+def test_a_world_reads_as_it_is_written() -> None:
+    assert World.of(str(SMALL)) == SMALL
+
+
+def test_the_targets_of_a_world_are_found() -> None:
+    final = list(Replay(SMALL.scenario(), sorted_scans(SMALL)).run())[-1]
+    assert list(final.status) == SMALL.tracks * [1]  # confirmed
+
+
+def sorted_scans(world: World) -> list[Scan]:
+    return sorted((scan for name in world.sensor_names for scan in world.seen_by(name)), key=lambda scan: scan.time_ns)
+
+
+def test_what_is_sent_is_what_nodes_send() -> None:
+    reports, proposals, plots = (list(messages(SMALL, "radar-0", kind)) for kind in ("reports", "proposals", "plots"))
+    assert len(reports) == len(proposals) == len(plots) == SMALL.scans
+    for report, proposal, scan in zip(reports, proposals, plots, strict=True):
+        assert isinstance(report, Report)
+        assert isinstance(proposal, Proposal)
+        assert isinstance(scan, Scan)
+        assert report.time_ns == proposal.time_ns == scan.time_ns
+        assert len(report.ids) == SMALL.tracks
+        assert len(proposal.x) < len(scan.z)
+    assert sum(len(message.x) for message in proposals if isinstance(message, Proposal)) > 0
+    assert any((one.x != two.x).any() for one, two in pairwise(reports) if isinstance(one, Report | Proposal))
+
+
+def test_latency_has_its_parts(processes: Processes, tmp_path: Path) -> None:
+    out = tmp_path / "latency.json"
+    options = ("--tracks", "1", "3", "--sensors", "2", "--scans", "20", "--rate", "20", "--json", out)
+    printed = processes.output("bench", "latency", *options)
+    rows = rows_of(out)
+    assert [(row["tracks"], row["sensors"], row["rate"]) for row in rows] == [
+        (tracks, 2, rate) for tracks in (1, 3) for rate in (20.0, "max")
+    ]
+    for row in rows:
+        for way in ("", "raw_zenoh_", "raw_tcp_"):
+            assert 0 < row[f"{way}p50_us"] <= row[f"{way}p99_us"] <= row[f"{way}p999_us"]
+        assert 0 < row["node_us"] + row["center_us"] < row["p99_us"]
+        assert row["scans"] == 20
+    assert sum(line.startswith("| 1 | 2 |") for line in printed) == 2
+
+
+@pytest.mark.netns
+def test_bandwidth_counts_payload_and_wire(processes: Processes, tmp_path: Path) -> None:
+    out, figure = tmp_path / "bandwidth.json", tmp_path / "bandwidth.png"
+    axes = ("--tracks", "100", "--sensors", "2", "--false-plots", "10")
+    processes.output(
+        "bench", "bandwidth", *axes, "--scans", "4", "--interval", "0.5", "--json", out, "--figure", figure
+    )
+    rows = rows_of(out)
+    assert {(row["codec"], row["sensors"]) for row in rows} == {(c, s) for c in ("float64", "float32") for s in (2, 4)}
+    for row in rows:
+        payload, wire = row["payload_bytes_per_track_scan"], row["wire_bytes_per_track_scan"]
+        assert payload <= {"float64": 140, "float32": 72}[row["codec"]]
+        assert payload == pytest.approx(row["reports_payload_bytes_per_scan"] / 100, abs=0.1)
+        assert payload < wire < 1.3 * payload
+        # 0.9 of 100 targets and 10 false plots of 16 bytes.
+        assert row["plots_payload_bytes_per_scan"] == pytest.approx(100 * 16, rel=0.15)
+        assert row["plots_payload_bytes_per_scan"] < row["plots_bytes_per_scan"] < 2.5 * 1600
+        assert row["proposals_payload_bytes_per_scan"] < row["proposals_bytes_per_scan"]
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    assert table(rows).count("float32") == 2
+    draw([], tmp_path / "empty.png")
+
+
+def test_float32_reports_hardly_change_log_lr_in_1000_scans() -> None:
+    row = compare("four-radars", 1000)
+    assert row["scans"] == 1000
+    assert row["largest_log_lr"] > 1000.0
+    assert 0.0 < row["log_lr_difference"] < 0.01
+    assert 0.0 < row["position_difference_m"] < 0.1
+
+
+def test_a_network_with_float32_reports_says_what_replay_says(tmp_path: Path) -> None:
+    plot = scenario(fusion={"precision": "float32"})
+    scans = all_scans(plot)
+    record = run_in_memory(plot, scans)
+    replayed = Replay(plot, scans).run()
+    log_lr = {m.time_ns: m.log_lr_total for m in replayed if not hasattr(m, "kind")}
+    assert len(log_lr) == 10
+    for time_ns, values in log_lr.items():
+        np.testing.assert_array_equal(record.pictures[time_ns].log_lr_total, values)
+    double = Replay(scenario(), scans).run()
+    assert any((m.log_lr_total != log_lr[m.time_ns]).any() for m in double if not hasattr(m, "kind"))

@@ -100,7 +100,7 @@ def center_scan(tracks: int) -> Callable[[], object]:
     x, P, log_g = prior.x + 10.0, 0.5 * SENSORS * prior.P, np.ones(tracks)
     later = round(DT * NS_PER_S)
     reports = {s: Report(str(s), 0, later, NEVER, 1, ids, np.ones_like(ids), log_g, x, P) for s in range(SENSORS)}
-    return lambda: fuser.advance(picture, later, reports)
+    return lambda: fuser.advance(fuser.expect(picture, later), reports)
 
 
 def stone_soup_scan() -> Callable[[], object]:

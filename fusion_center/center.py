@@ -19,7 +19,7 @@ from common.estimation.gaussian import Gaussian
 from common.estimation.sprt import Status
 from common.messages import NEVER, Advice, Clock, Decision, Join, Message, Report, Start, Stop, Tracks
 from common.quantities import NS_PER_S
-from fusion_center.picture import Fuser, Picture
+from fusion_center.picture import Expected, Fuser, Picture
 
 #: Wall time between the clock's announcement and its start: nodes on a slow link hear of it in time.
 _LEAD_NS = 50_000_000
@@ -109,6 +109,7 @@ class State(NamedTuple):
         base_ns: its time.
         history: checkpoints inside the window, oldest first.
         counts: of reports.
+        expected: worked out ahead for the next measurement time, or None. It saves time and changes nothing.
     """
 
     first_join_ns: int | None
@@ -119,6 +120,7 @@ class State(NamedTuple):
     base_ns: int
     history: tuple[Checkpoint, ...]
     counts: Counts
+    expected: Expected | None = None
 
     @property
     def picture(self) -> Picture:
@@ -229,6 +231,14 @@ class Center:
         state, clear = self._clear(state)
         return state, [*messages, *clock, *released, *clear]
 
+    def prepare(self, state: State) -> State:
+        """Work out ahead what the next measurement time will need, unless that is done or none is known."""
+        nexts = [member.next_ns for member in state.members if member.joined and member.alive]
+        time_ns = min([*state.waiting, *nexts], default=NEVER)
+        if time_ns <= state.time_ns or time_ns == NEVER:
+            return state
+        return state._replace(expected=self._expected(state, time_ns))
+
     def deadline_ns(self, state: State) -> int | None:
         """Wall time at which a tick will change something; None: nothing is waited for."""
         if state.clock is None:
@@ -335,8 +345,15 @@ class Center:
         return state, [*_corrections(before, after), *pictures]
 
     def _work_in(self, state: State, time_ns: int, reports: Mapping[int, Report]) -> State:
-        picture, decisions = self.fuser.advance(state.picture, time_ns, reports)
+        picture, decisions = self.fuser.advance(self._expected(state, time_ns), reports)
         return state._replace(history=(*state.history, Checkpoint(time_ns, reports, picture, tuple(decisions))))
+
+    def _expected(self, state: State, time_ns: int) -> Expected:
+        """The newest picture at a later time: as it was prepared, where that still holds."""
+        expected = state.expected
+        if expected is not None and expected.picture is state.picture and expected.t_ns == time_ns:
+            return expected
+        return self.fuser.expect(state.picture, time_ns)
 
     def _begin(self, state: State, now_ns: int) -> tuple[State, list[Message]]:
         """Start the clock once all sensors are there, or after the wait with those that are."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from common.config import Scenario
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, product
+from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, product
 from common.estimation.motion import Motion
 from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
@@ -56,6 +56,30 @@ class Picture(NamedTuple):
     P: Array
     fused_x: Array
     fused_P: Array
+    network_P: Array
+
+
+class Expected(NamedTuple):
+    """A picture at its next measurement time: all that does not depend on what will be reported.
+
+    Attributes:
+        picture: that it was worked out from.
+        t_ns: the measurement time.
+        kept: the tracks that had not been deleted.
+        live: which of them started before.
+        moving: those.
+        factors: those, predicted.
+        product: of the predicted factors.
+        network_P: for ``dkf``, the covariances that all factors have by the models alone, predicted.
+    """
+
+    picture: Picture
+    t_ns: int
+    kept: Picture
+    live: BoolArray
+    moving: Picture
+    factors: Gaussian
+    product: Product
     network_P: Array
 
 
@@ -156,38 +180,43 @@ class Fuser:
         both = concatenate(picture, new)
         return take(both, np.argsort(both.ids))
 
-    def advance(self, picture: Picture, t_ns: int, reports: Mapping[int, Report]) -> tuple[Picture, list[Decision]]:
+    def expect(self, picture: Picture, t_ns: int) -> Expected:
+        """Work out what a picture will be at a measurement time, as far as no report is needed for it."""
+        kept = take(picture, picture.status != Status.DELETED)
+        live = kept.times_ns < t_ns
+        moving = take(kept, live)
+        factors, network_P = self._predict(moving, t_ns)
+        return Expected(picture, t_ns, kept, live, moving, factors, product(factors), network_P)
+
+    def advance(self, expected: Expected, reports: Mapping[int, Report]) -> tuple[Picture, list[Decision]]:
         """Work in all reports of one measurement time.
 
         A sensor that is silent, or does not report a track, keeps its factor there, predicted, with p_bar = 1.
 
         Args:
-            picture: at the measurement time before.
-            t_ns: the measurement time.
+            expected: the picture, predicted to the measurement time.
             reports: by number of the sensor.
 
         Returns:
-            the picture at ``t_ns`` and what was decided.
+            the picture at the measurement time and what was decided.
         """
-        picture = take(picture, picture.status != Status.DELETED)
-        live = picture.times_ns < t_ns
-        moved = self._move(take(picture, live), t_ns, reports)
-        moved, decisions = self._decide(moved, t_ns)
-        return (moved if live.all() else put(picture, live, moved)), decisions
+        moved, decisions = self._decide(self._move(expected, reports), expected.t_ns)
+        return (moved if expected.live.all() else put(expected.kept, expected.live, moved)), decisions
 
-    def _move(self, picture: Picture, t_ns: int, reports: Mapping[int, Report]) -> Picture:
-        predicted, network_P = self._predict(picture, t_ns)
-        said = _collect(picture, predicted, reports)
-        before = product(predicted)
-        after = product(Gaussian(said.x, said.P)) if said.who.any() else before
+    def _move(self, expected: Expected, reports: Mapping[int, Report]) -> Picture:
+        picture, before = expected.moving, expected.product
+        said = _collect(picture, expected.factors, reports)
+        heard = said.who.any(axis=-1)
+        after = product(Gaussian(said.x, said.P)) if heard.any() else before
         # Cumulative sums that are both -inf have not changed.
         same = said.log_p_bar == picture.log_p_bar
         evidence = np.where(same, 0.0, said.log_p_bar - np.where(same, 0.0, picture.log_p_bar))
         # A track that nobody reported stays as it is, to the last digit.
-        step = np.where(said.who.any(axis=-1), log_lambda(before, after, evidence), 0.0)
+        step = np.where(heard, log_lambda(before, after, evidence), 0.0)
+        network_P = self._shrunk(expected.network_P, reports) if self.globalised else expected.network_P
         return picture._replace(
-            times_ns=np.full_like(picture.times_ns, t_ns),
-            scans=picture.scans + said.who.any(axis=-1),
+            times_ns=np.full_like(picture.times_ns, expected.t_ns),
+            scans=picture.scans + heard,
             log_lr=picture.log_lr + step,
             log_lr_total=picture.log_lr_total + step,
             log_p_bar=said.log_p_bar,
@@ -197,7 +226,7 @@ class Fuser:
             P=said.P,
             fused_x=after.density.x,
             fused_P=after.density.P,
-            network_P=self._shrunk(network_P, reports) if self.globalised else network_P,
+            network_P=network_P,
         )
 
     def _predict(self, picture: Picture, t_ns: int) -> tuple[Gaussian, Array]:
@@ -254,7 +283,7 @@ def _collect(picture: Picture, predicted: Gaussian, reports: Mapping[int, Report
 
 def _common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:
     """Where ids that both have stand in each; mostly both have the same."""
-    if np.array_equal(ours, theirs):
+    if len(ours) == len(theirs) and (ours == theirs).all():
         return slice(None), slice(None)
     _, rows, others = np.intersect1d(ours, theirs, assume_unique=True, return_indices=True)
     return rows, others

@@ -112,6 +112,8 @@ class CenterShell:
                 self.complaints.add(
                     f"{kind} message" if isinstance(event, Join) else f"{kind} report", _summary(event), new - old
                 )
+        if self._inbox.empty:
+            self._state = self._center.prepare(self._state)
 
     def _say_presence(self, name: str, alive: bool) -> None:
         if name not in self._center.names:

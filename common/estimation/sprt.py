@@ -85,5 +85,6 @@ def decide(log_lr: Array, status: StatusArray, limits: Thresholds) -> Verdict:
     alive = status != Status.DELETED
     accepted = alive & (log_lr > limits.log_b)
     rejected = alive & (log_lr < limits.log_a)
-    new = np.select([accepted, rejected], [Status.CONFIRMED, Status.DELETED], status).astype(np.uint8)
+    new = status.copy()
+    new[accepted], new[rejected] = Status.CONFIRMED, Status.DELETED
     return Verdict(np.where(accepted, 0.0, log_lr), new, accepted, rejected)

@@ -6,6 +6,8 @@ import time
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeAlias
 
+from common.health import Answer
+
 
 class Heard(NamedTuple):
     """Bytes came in on a key."""
@@ -42,6 +44,12 @@ class Exited(NamedTuple):
     code: int
 
 
+class Asked(NamedTuple):
+    """Somebody asks how the process is."""
+
+    answer: Answer
+
+
 class Stopped(NamedTuple):
     """The process shall end."""
 
@@ -50,7 +58,7 @@ class Elapsed(NamedTuple):
     """Nothing came in until the time asked for."""
 
 
-Incoming: TypeAlias = Heard | Present | Missed | Said | Exited | Stopped | Elapsed
+Incoming: TypeAlias = Heard | Present | Missed | Said | Exited | Asked | Stopped | Elapsed
 
 
 class Inbox:
@@ -79,6 +87,10 @@ class Inbox:
     def exited(self, name: str, code: int) -> None:
         """Put the end of a child process."""
         self._queue.put(Exited(name, code))
+
+    def asked(self, answer: Answer) -> None:
+        """Put the question how the process is."""
+        self._queue.put(Asked(answer))
 
     def stop(self) -> None:
         """Put the request to end."""

@@ -40,6 +40,9 @@ def speed_factor(_: object, tokens: Sequence[Token]) -> float:
 #: Of a simulated world.
 Seed: TypeAlias = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 
+#: Socket at which a process answers how it is; ask with python -m common.health.
+HealthSocket: TypeAlias = Annotated[Path | None, Parameter(name="--health")]
+
 #: A switch for launchers, not for people.
 Hidden: TypeAlias = Annotated[bool, Parameter(show=False)]
 

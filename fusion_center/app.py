@@ -6,9 +6,10 @@ import json
 import time
 
 from common.config import load_scenario
+from common.health import answering
 from common.inbox import Inbox
 from common.logs import LogFormat, configure
-from common.process import Hidden, NetworkOptions, Speed, stopped_by_signals
+from common.process import HealthSocket, Hidden, NetworkOptions, Speed, stopped_by_signals
 from common.transport import open_zenoh
 from fusion_center.center import Center
 from fusion_center.shell import CenterShell
@@ -21,6 +22,7 @@ def center(
     options: NetworkOptions | None = None,
     speed: Speed = 1.0,
     wait: float = 10.0,
+    health: HealthSocket = None,
     log: LogFormat = "auto",
     with_parent: Hidden = False,
 ) -> None:
@@ -33,6 +35,7 @@ def center(
         options: the network.
         speed: seconds of measurement time per second, for sources without a clock; max: as fast as all go together.
         wait: seconds to wait for the others once a sensor has joined; then the clock starts with those that are there.
+        health: local socket at which this process answers how it is (see: python -m common.health).
         log: how to log to standard error; auto: colour on a terminal, JSON elsewhere.
         with_parent: end when standard input closes.
     """
@@ -41,6 +44,7 @@ def center(
     network = (options or NetworkOptions()).over(loaded)
     fusion = Center.of(loaded, speed=speed, wait_s=wait, first_epoch=time.time_ns())
     inbox = Inbox()
-    with stopped_by_signals(inbox.stop, with_parent=with_parent), open_zenoh(network) as bus:
+    stoppable = stopped_by_signals(inbox.stop, with_parent=with_parent)
+    with stoppable, answering(health, inbox.asked), open_zenoh(network) as bus:
         print(json.dumps({"listening": bus.endpoints()}), flush=True)  # noqa: T201 (for whoever started it)
         CenterShell(bus, network, loaded, fusion, inbox=inbox).run()

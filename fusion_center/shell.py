@@ -9,7 +9,8 @@ import structlog
 from common.codec import decode, encode
 from common.config import Network, Scenario
 from common.errors import DecodeError
-from common.inbox import Heard, Inbox, Incoming, Missed, Present, Stopped
+from common.health import Health, age_s
+from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Decision, Join, Keys, Message, Report, Tracks, sensor_of
 from common.transport import Bus, Publisher
@@ -43,6 +44,7 @@ class CenterShell:
         self._publishers: dict[str, Publisher] = {}
         self._picture: Tracks = center.tracks(self._state)
         self._stopped = False
+        self._reported_s: float | None = None
 
     def stop(self) -> None:
         """End ``run`` soon."""
@@ -81,10 +83,25 @@ class CenterShell:
                 self._say_presence(sensor_of(key), alive)
             case Missed(key, number):
                 self.complaints.add("lost reports", f"{key}: the next one restores their evidence", number)
+            case Asked(answer):
+                answer(self._health())
             case Stopped():
                 self._stopped = True
             case _:
                 self._step(Tick())
+
+    def _health(self) -> Health:
+        sensors = [name for name, member in zip(self._center.names, self._state.members, strict=True) if member.alive]
+        return {
+            "role": "center",
+            "linked": bool(sensors),
+            "last_report_s": age_s(self._reported_s),
+            "sensors": sensors,
+            "of": len(self._center.names),
+            "tracks": len(self._picture.ids),
+            "reports": self._state.counts._asdict(),
+            "dropped": dict(self.complaints.counts),
+        }
 
     def _hear(self, key: str, payload: bytes) -> None:
         try:
@@ -93,6 +110,8 @@ class CenterShell:
             self.complaints.add("bad bytes", str(error))
             return
         if isinstance(message, Report | Join):
+            if isinstance(message, Report):
+                self._reported_s = time.monotonic()
             self._step(message)
         else:
             self.complaints.add("unexpected", f"{key}: a {type(message).__name__} from a sensor")

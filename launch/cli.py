@@ -17,7 +17,7 @@ from common.config import Network, Scenario, load_scenario
 from common.estimation.sprt import Status
 from common.logs import LogFormat, configure
 from common.messages import Tracks
-from common.process import Seed, Speed
+from common.process import HealthSocket, NetworkOptions, Seed, Speed
 from common.process import main as run_app
 from fusion_center.app import center
 from scenarios.catalogue import find, names
@@ -148,24 +148,50 @@ def check(scenario: str, plots: Path | None = None) -> None:
 
 @app.command
 def router(
-    *, listen: Annotated[tuple[str, ...], Parameter(negative=())] = ("tcp/127.0.0.1:7447",), log: LogFormat = "auto"
+    *,
+    listen: Annotated[tuple[str, ...], Parameter(negative=())] = ("tcp/127.0.0.1:7447",),
+    health: HealthSocket = None,
+    log: LogFormat = "auto",
 ) -> None:
     """Run a Zenoh router, to which nodes and center connect as clients (--mode client).
 
     Args:
         listen: endpoint to listen on; may be given several times. tcp/0.0.0.0:7447 is open to all hosts.
+        health: local socket at which this process answers how it is (see: python -m common.health).
         log: how to log to standard error.
     """
-    from threading import Event
-
-    from common.process import stopped_by_signals
-    from common.transport import open_zenoh
+    from launch.router import serve
 
     configure(log)
-    ended = Event()
-    with open_zenoh(Network(mode="router", listen=listen)) as bus, stopped_by_signals(ended.set):
-        print(json.dumps({"listening": bus.endpoints()}), flush=True)
-        ended.wait()
+    serve(Network(mode="router", listen=listen), health)
+
+
+@app.command
+def watch(
+    scenario: str,
+    *,
+    options: NetworkOptions | None = None,
+    until_end: Annotated[bool, Parameter(negative=())] = False,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    health: HealthSocket = None,
+    log: LogFormat = "auto",
+) -> None:
+    """Print the decisions of a running network, and who comes and goes, until Ctrl-C.
+
+    Args:
+        scenario: scenario file, or name of one that comes along; for the network's name and the epoch of times.
+        options: the network.
+        until_end: end once all sources are exhausted.
+        as_json: print JSON lines.
+        health: local socket at which this process answers how it is (see: python -m common.health).
+        log: how to log to standard error.
+    """
+    from launch.watch import watch
+
+    configure(log)
+    loaded = load_scenario(find(scenario))
+    network = (options or NetworkOptions()).over(loaded)
+    watch(loaded, network, until_end=until_end, as_json=as_json, health=health)
 
 
 @app.command

@@ -13,6 +13,7 @@ from rich.text import Text
 
 from common.estimation.sprt import Status
 from common.messages import Decision, Tracks
+from studies.lines import decision_text
 from studies.record import Record
 
 _STYLE = {Status.TENTATIVE: "yellow", Status.CONFIRMED: "bold green", Status.DELETED: "red"}
@@ -58,12 +59,7 @@ class LiveStatus:
     def decided(self, decision: Decision) -> None:
         """Say what was decided."""
         style = {"confirmed": "green", "deleted": "red"}.get(decision.kind, "yellow")
-        time_s = self._record.scenario.to_seconds(decision.time_ns)
-        self.say(
-            f"{time_s:8.2f} s  track {decision.track} {decision.kind} after {decision.scans} scans, "
-            f"log LR {decision.log_lr:+.2f}",
-            style,
-        )
+        self.say(decision_text(decision, self._record.scenario), style)
 
     def present(self, sensor: str, alive: bool) -> None:
         """Note which sensors are there."""

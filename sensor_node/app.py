@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from common.config import load_scenario
+from common.health import answering
 from common.inbox import Inbox
 from common.logs import LogFormat, configure
-from common.process import Hidden, NetworkOptions, Seed, stopped_by_signals
+from common.process import HealthSocket, Hidden, NetworkOptions, Seed, stopped_by_signals
 from common.transport import open_zenoh
 from scenarios.catalogue import find
 from sensor_node.shell import NodeShell
@@ -23,6 +24,7 @@ def node(
     plots: Path | None = None,
     seed: Seed | None = None,
     patience: float = 30.0,
+    health: HealthSocket = None,
     log: LogFormat = "auto",
     with_parent: Hidden = False,
 ) -> None:
@@ -35,6 +37,7 @@ def node(
         plots: recorded plots (JSON Lines) instead of the scenario's.
         seed: of the simulated world, instead of the scenario's.
         patience: seconds to wait for the first answer of a center before giving up.
+        health: local socket at which this process answers how it is (see: python -m common.health).
         log: how to log to standard error; auto: colour on a terminal, JSON elsewhere.
         with_parent: end when standard input closes.
     """
@@ -44,5 +47,6 @@ def node(
     seen = source(loaded, loaded.sensor(sensor).name, plots=plots, seed=seed)
     tracker = LocalTracker.of(loaded, sensor, seen.schedule)
     network = (options or NetworkOptions()).over(loaded)
-    with stopped_by_signals(inbox.stop, with_parent=with_parent), open_zenoh(network) as bus:
+    stoppable = stopped_by_signals(inbox.stop, with_parent=with_parent)
+    with stoppable, answering(health, inbox.asked), open_zenoh(network) as bus:
         NodeShell(bus, network, tracker, seen.scans, inbox=inbox, patience_s=patience).run()

@@ -12,7 +12,8 @@ import structlog
 from common.codec import decode, encode
 from common.config import Network
 from common.errors import ConfigError, DecodeError, TransportError, VersionError
-from common.inbox import Heard, Inbox, Incoming, Missed, Present, Stopped
+from common.health import Health, age_s
+from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Scan, Start, Stop
 from common.transport import Bus, Publisher
@@ -62,6 +63,7 @@ class NodeShell:
         self._answered = self._stopped = False
         self._began_ns = self._joined_ns = self._ask_ns = 0
         self._gone_ns: int | None = None
+        self._reported_s: float | None = None
         self._keys = Keys(network.name)
         self._publishers: dict[str, Publisher] = {}
 
@@ -123,10 +125,24 @@ class NodeShell:
                 # What the center said last comes with its answer.
                 self.complaints.add("lost messages", key, number)
                 self._join()
+            case Asked(answer):
+                answer(self._health())
             case Stopped():
                 self._stopped = True
             case _:
                 self._ask_again()
+
+    def _health(self) -> Health:
+        return {
+            "role": "node",
+            "sensor": self._name,
+            "linked": self._center,
+            "last_report_s": age_s(self._reported_s),
+            "scans": self._position,
+            "of": len(self._scans),
+            "tracks": len(self._state.tracks.ids),
+            "dropped": dict(self.complaints.counts),
+        }
 
     def _center_changed(self, alive: bool) -> None:
         if self._center and not alive:
@@ -224,6 +240,7 @@ class NodeShell:
         self._position += 1
         self._state, report = self._tracker.scan(self._state, scan, self._next_ns())
         self._publish(report)
+        self._reported_s = time.monotonic()
         if self._publishers[self._keys.plots(self._name)].has_listeners:
             self._publish(scan)
 

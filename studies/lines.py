@@ -1,4 +1,4 @@
-"""Tracks as JSON Lines: what ``waldnet replay --json`` prints and a run's report keeps."""
+"""Tracks and decisions as JSON and as lines for people: what replay, watch and a run's report say."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from common.config import Scenario
 from common.estimation.sprt import Status
-from common.messages import Tracks
+from common.messages import Decision, Tracks
 
 _LARGEST = float(np.finfo(np.float64).max)
 
@@ -41,6 +41,27 @@ def _entry(tracks: Tracks, row: int) -> dict[str, Any]:
         "x": tracks.x[row].tolist(),
         "P": tracks.P[row].tolist(),
     }
+
+
+def decision_entry(decision: Decision, scenario: Scenario) -> dict[str, Any]:
+    """A decision as JSON."""
+    return {
+        "kind": decision.kind,
+        "track": decision.track,
+        "time": scenario.to_seconds(decision.time_ns),
+        "log_lr": finite(decision.log_lr),
+        "log_lr_total": finite(decision.log_lr_total),
+        "scans": decision.scans,
+    }
+
+
+def decision_text(decision: Decision, scenario: Scenario) -> str:
+    """A decision for people."""
+    time_s = scenario.to_seconds(decision.time_ns)
+    return (
+        f"{time_s:8.2f} s  track {decision.track} {decision.kind} after {decision.scans} scans, "
+        f"log LR {decision.log_lr:+.2f}"
+    )
 
 
 def finite(value: float) -> float:

@@ -14,7 +14,7 @@ from common.config import Scenario
 from common.estimation.gaussian import Array
 from common.estimation.sprt import Status
 from common.messages import Decision, Message, Scan, Tracks
-from studies.lines import TrackLines, finite
+from studies.lines import TrackLines, decision_entry, finite
 
 
 class History(NamedTuple):
@@ -93,7 +93,7 @@ class Record:
     def summary(self, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Decisions and outcome as JSON."""
         limits = self.scenario.decision.thresholds
-        decisions = [self._decision(decision) for decision in self.standing()]
+        decisions = [decision_entry(decision, self.scenario) for decision in self.standing()]
         return {
             "scenario": self.scenario.name,
             **extra,
@@ -110,18 +110,8 @@ class Record:
                 }
                 for track, history in self.histories().items()
             ],
-            "withdrawn": [self._decision(d) for d in self.decisions if d.kind == "withdrawn"],
+            "withdrawn": [decision_entry(d, self.scenario) for d in self.decisions if d.kind == "withdrawn"],
             "sensors_lost": dict(self.lost),
-        }
-
-    def _decision(self, decision: Decision) -> dict[str, Any]:
-        return {
-            "kind": decision.kind,
-            "track": decision.track,
-            "time": self.scenario.to_seconds(decision.time_ns),
-            "log_lr": finite(decision.log_lr),
-            "log_lr_total": finite(decision.log_lr_total),
-            "scans": decision.scans,
         }
 
 

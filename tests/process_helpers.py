@@ -6,6 +6,7 @@ import json
 import os
 import select
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -129,8 +130,11 @@ class Processes:
 
     def waldnet(self, *arguments: object) -> Process:
         """Start ``waldnet`` with arguments."""
-        command = [str(Path(sys.executable).with_name("waldnet")), *map(str, arguments)]
-        self._started.append(Process(command, self._family, self.cwd))
+        return self.start(str(Path(sys.executable).with_name("waldnet")), *map(str, arguments))
+
+    def start(self, *command: str) -> Process:
+        """Start a command."""
+        self._started.append(Process(list(command), self._family, self.cwd))
         return self._started[-1]
 
     def output(self, *arguments: object) -> list[str]:
@@ -240,12 +244,16 @@ class Observer:
         for key in (self.keys.tracks(), self.keys.decision()):
             bus.subscribe(key, self._inbox.heard)
         bus.watch(self.keys.center_alive(), self._inbox.present)
-        self._until(lambda news: isinstance(news, Present))
+        self.await_center(alive=True)
         self.fence()
 
     def fence(self) -> None:
         """Return once the center has taken in all that was declared and said before."""
         assert self.bus.ask(self.keys.picture(), PATIENCE_S), "the center does not answer"
+
+    def await_center(self, *, alive: bool) -> None:
+        """Return once the center is there, or gone."""
+        self._until(lambda news: isinstance(news, Present) and news.alive == alive)
 
     def await_tracks(self, wanted: Callable[[Tracks], bool]) -> Tracks:
         """The next picture that is as wanted."""
@@ -261,7 +269,7 @@ class Observer:
 
     def follow_to_the_end(self) -> Record:
         """Everything until the center leaves; then what is still on its way."""
-        self._until(lambda news: isinstance(news, Present) and not news.alive)
+        self.await_center(alive=False)
         self.bus.close()
         while not self._inbox.empty:
             self._next()
@@ -321,6 +329,12 @@ def variant(folder: Path, name: str, *changes: tuple[str, str], of: str = "four-
     path = folder / f"{name}.toml"
     path.write_text(text.replace(f'name = "{of}"', f'name = "{name}"', 1), encoding="utf-8")
     return path
+
+
+def free_endpoint() -> str:
+    """An endpoint on a port that is free now."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"tcp/127.0.0.1:{server.getsockname()[1]}"
 
 
 def log_entries(lines: list[str]) -> Iterator[dict[str, Any]]:

@@ -27,6 +27,7 @@ from process_helpers import (
     Process,
     Processes,
     assert_agree,
+    free_endpoint,
     log_entries,
     observe,
     peer_of,
@@ -345,11 +346,6 @@ def test_a_node_without_a_center_gives_up(processes: Processes) -> None:
         r"no center of network 'four-radars' answered 'radar-1' within [12] s \(peer at tcp/127\.0\.0\.1:\d+\): .*",
         node.err[-1],
     )
-
-
-def free_endpoint() -> str:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return f"tcp/127.0.0.1:{server.getsockname()[1]}"
 
 
 @pytest.mark.parametrize("command", [("center", "four-radars"), ("router",)], ids=lambda command: command[0])

@@ -2,8 +2,8 @@
 
     python -m benchmarks.figures docs/performance.md [WORD ...]
 
-A place begins with the line ``<!-- figures: COMMAND -->`` and ends with ``<!-- end -->``. With words, only commands that
-contain one of them are run.
+A place begins with the line ``<!-- figures: COMMAND -->`` and ends with ``<!-- end -->``. With words, only commands
+that contain one of them are run.
 """
 
 from __future__ import annotations

@@ -2,58 +2,42 @@
 
 from __future__ import annotations
 
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from common.estimation.association import Plots, gate_threshold
-from common.estimation.gaussian import Array, Gaussian, times_transposed
-from common.estimation.sensing import Linearised
+from common.estimation.gaussian import Array, BoolArray
 
 IntArray: TypeAlias = NDArray[np.intp]
 
-#: Up to so many pairs of track and plot it is cheaper to look at all of them.
-_FEW_PAIRS = 4000
 
+class Near(NamedTuple):
+    """The plots near each track, padded.
 
-def candidates(z: Array, predicted: Gaussian, sensor: Linearised, p_g: float) -> Plots:
-    """Plots of a scan for a batch of tracks, without most of those that no gate holds.
-
-    A gate is an ellipsoid; every plot inside the box around it is kept, so a filter that gates them gives what it gives
-    with all plots.
-
-    Args:
-        z: all plots, shape (M, m).
-        predicted: tracks, shapes (T, n), (T, n, n).
-        sensor: linearised at ``predicted.x``.
-        p_g: probability that the target's plot is inside the gate; 1 is no gate.
-
-    Returns:
-        plots of shape (M, m), the same for all tracks, where there are few; else of shape (T, K, m), K the most plots
-        that any track has.
+    Attributes:
+        which: numbers of the plots, shape (T, K), K the most plots that any track has.
+        valid: shape (T, K); false marks padding.
     """
-    tracks, plots = len(predicted.x), len(z)
-    everything = Plots(z, np.ones(plots, np.bool_))
-    if p_g >= 1.0 or tracks * plots <= _FEW_PAIRS:
-        return everything
-    HP = times_transposed(predicted.P, sensor.H).mT
-    variances = (HP * sensor.H).sum(axis=-1) + np.diagonal(sensor.R)
-    # A little wider, so that rounding loses none.
-    reach = np.sqrt(gate_threshold(p_g, z.shape[-1]) * variances) * (1.0 + 1e-9)
-    track, plot = _pairs_in_boxes(z, sensor.z, reach)
-    counts = np.bincount(track, minlength=tracks)
-    valid = np.arange(counts.max()) < counts[:, None]
-    which = np.zeros(valid.shape, np.int64)
-    which[valid] = plot
-    return Plots(z[which], valid)
+
+    which: IntArray
+    valid: BoolArray
 
 
-def _pairs_in_boxes(z: Array, centers: Array, reach: Array) -> tuple[IntArray, IntArray]:
-    """Track and plot of every plot inside the box ``centers +- reach`` of a track, by track.
+def inside_boxes(z: Array, centers: Array, reach: Array) -> Near:
+    """The plots inside the box ``centers +- reach`` of each track.
 
     The plots are sorted along one axis, so that a slab of them is left for every box; its other sides are then tested.
+
+    Args:
+        z: plots, shape (M, m), M > 0.
+        centers: expected plots of the tracks, shape (T, m), T > 0.
+        reach: half of each side of the boxes, shape (T, m).
+
+    Returns:
+        the plots of each track.
     """
+    # The axis along which a box holds the smallest part of all plots.
     axis = int(np.argmin(reach.mean(axis=0) / np.ptp(z, axis=0).clip(1e-300)))
     order = np.argsort(z[:, axis])
     along = z[order, axis]
@@ -62,5 +46,11 @@ def _pairs_in_boxes(z: Array, centers: Array, reach: Array) -> tuple[IntArray, I
     track = np.repeat(np.arange(len(centers)), counts)
     rank = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
     plot = order[np.repeat(first, counts) + rank]
-    inside = (np.abs(z[plot] - centers[track]) <= reach[track]).all(axis=-1)
-    return track[inside], plot[inside]
+    for other in set(range(z.shape[-1])) - {axis}:
+        inside = np.abs(z[plot, other] - centers[track, other]) <= reach[track, other]
+        track, plot = track[inside], plot[inside]
+    counts = np.bincount(track, minlength=len(centers))
+    valid = np.arange(counts.max()) < counts[:, None]
+    which = np.zeros(valid.shape, np.intp)
+    which[valid] = plot
+    return Near(which, valid)

@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.estimation.association import Clutter, pdaf
-from common.estimation.gating import candidates
+from common.estimation import association
+from common.estimation.association import Clutter, Plots, pdaf, tight
+from common.estimation.gating import inside_boxes
 from common.estimation.gaussian import Gaussian
 from common.estimation.sensing import Position
 
@@ -14,52 +15,64 @@ SENSOR = Position((50.0, 20.0), 4)
 ORIGIN = np.zeros(2)
 
 
-def world(rng: np.random.Generator, tracks: int, plots: int, extent: float = 3e4) -> tuple[Gaussian, Any]:
+def tracks_on_a_field(rng: np.random.Generator, tracks: int, extent: float) -> Gaussian:
     x = np.concatenate([rng.uniform(-extent, extent, (tracks, 2)), rng.normal(0, 50, (tracks, 2))], axis=-1)
     root = rng.normal(0, 60, (tracks, 4, 4)) * rng.uniform(0.1, 5.0, (tracks, 1, 1))
-    z = np.concatenate([rng.uniform(-extent, extent, (plots, 2)), x[:, :2] + rng.normal(0, 100, (tracks, 2))])
-    return Gaussian(x, root @ root.mT + np.eye(4)), z[rng.permutation(len(z))]
+    return Gaussian(x, root @ root.mT + np.eye(4))
 
 
-def filtered(tracks: Gaussian, plots: Any, p_g: float) -> Any:
-    clutter = Clutter(np.full(len(tracks.x), 0.9), np.array(-15.0), p_g)
-    return pdaf(tracks, plots, SENSOR.linearise(tracks.x, ORIGIN), clutter)
+def world(tracks: int, plots: int, extent: float = 3e4) -> tuple[Gaussian, Any]:
+    rng = np.random.default_rng(tracks)
+    density = tracks_on_a_field(rng, tracks, extent)
+    near = density.x[:, :2] + rng.normal(0, 100, (tracks, 2))
+    z = np.concatenate([rng.uniform(-extent, extent, (plots, 2)), near])
+    return density, z[rng.permutation(len(z))]
+
+
+def filtered(density: Gaussian, z: Any, p_g: float) -> list[Any]:
+    """Both filters, flat."""
+    clutter = Clutter(np.full(len(density.x), 0.9), np.array(-15.0), p_g)
+    linear, plots = SENSOR.linearise(density.x, ORIGIN), Plots(z)
+    wider = density._replace(P=4.0 * density.P)
+    (one, log_one), ((two, log_two), three) = (
+        pdaf(density, plots, linear, clutter),
+        tight(wider, density, plots, (linear, linear), clutter),
+    )
+    return [*one, log_one, *two, log_two, *three]
 
 
 @pytest.mark.parametrize(("tracks", "plots"), [(300, 500), (1, 9000), (3000, 2), (80, 80)])
-@pytest.mark.parametrize("p_g", [0.5, 0.9997, 1.0 - 1e-12])
-def test_a_filter_does_not_miss_the_plots_left_out(tracks: int, plots: int, p_g: float) -> None:
-    density, z = world(np.random.default_rng(tracks), tracks, plots)
-    few = candidates(z, density, SENSOR.linearise(density.x, ORIGIN), p_g)
-    assert few.z.shape[:-1] == few.valid.shape == (tracks, few.valid.shape[1])
-    assert few.valid.sum() < 0.5 * tracks * len(z)
-    everything = candidates(z, density, SENSOR.linearise(density.x, ORIGIN), 1.0)
-    (few_x, few_P), few_log = filtered(density, few, p_g)
-    (all_x, all_P), all_log = filtered(density, everything, p_g)
-    np.testing.assert_allclose(few_x, all_x, rtol=1e-12, atol=1e-9)
-    np.testing.assert_allclose(few_P, all_P, rtol=1e-9, atol=1e-7)
-    np.testing.assert_allclose(few_log, all_log, rtol=1e-12, atol=1e-12)
-
-
-def test_without_a_gate_every_plot_counts() -> None:
-    density, z = world(np.random.default_rng(1), 100, 100)
-    plots = candidates(z, density, SENSOR.linearise(density.x, ORIGIN), 1.0)
-    assert plots.z is z
-    assert plots.valid.all()
+@pytest.mark.parametrize("p_g", [0.5, 0.9997, 1.0 - 1e-12, 1.0])
+def test_plots_out_of_reach_change_nothing(
+    tracks: int, plots: int, p_g: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    density, z = world(tracks, plots)
+    few = filtered(density, z, p_g)
+    monkeypatch.setattr(association, "_FEW_PAIRS", 10**9)
+    for got, expected in zip(few, filtered(density, z, p_g), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-7)
 
 
 @pytest.mark.parametrize(("tracks", "plots"), [(0, 0), (0, 9000), (9000, 0), (1, 1)])
 def test_no_track_or_no_plot(tracks: int, plots: int) -> None:
     density = Gaussian(np.zeros((tracks, 4)), np.repeat(np.eye(4)[None], tracks, axis=0))
-    found = candidates(np.ones((plots, 2)), density, SENSOR.linearise(density.x, ORIGIN), 0.99)
-    assert len(found.z) == plots
+    assert len(filtered(density, np.ones((plots, 2)), 0.99)[0]) == tracks
 
 
 def test_a_scan_far_from_every_track_is_an_empty_scan() -> None:
-    density, _ = world(np.random.default_rng(1), 1000, 0)
-    z = np.full((1000, 2), 1e8)
-    found = candidates(z, density, SENSOR.linearise(density.x, ORIGIN), 0.9997)
-    assert not found.valid.any()
-    (x, _), log_p_bar = filtered(density, found, 0.9997)
+    density, _ = world(1000, 0)
+    x, _, log_p_bar, *_ = filtered(density, np.full((1000, 2), 1e8), 0.9997)
     np.testing.assert_array_equal(x, density.x)
     np.testing.assert_allclose(log_p_bar, np.log1p(-0.9 * 0.9997))
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+def test_boxes_hold_what_brute_force_finds(m: int) -> None:
+    rng = np.random.default_rng(m)
+    z, centers = rng.uniform(0, 10, (200, m)), rng.uniform(0, 10, (150, m))
+    reach = rng.uniform(0, 2, (150, m))
+    near = inside_boxes(z, centers, reach)
+    inside = (np.abs(z - centers[:, None]) <= reach[:, None]).all(axis=-1)
+    for track in range(150):
+        assert sorted(near.which[track][near.valid[track]]) == list(np.flatnonzero(inside[track]))
+    assert near.valid.shape[1] == inside.sum(axis=1).max()

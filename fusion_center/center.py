@@ -15,8 +15,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from common.config import FusionConfig, Scenario
+from common.estimation.batch import take
 from common.estimation.gaussian import Gaussian
-from common.estimation.sprt import Status
+from common.estimation.sprt import DELETED
 from common.messages import NEVER, Advice, Clock, Decision, Join, Message, Report, Start, Stop, Tracks
 from common.quantities import NS_PER_S
 from fusion_center.picture import Expected, Fuser, Picture
@@ -275,7 +276,7 @@ class Center:
 
         A report is the whole state of a factor, so the center is every node's backup.
         """
-        live = picture.status != Status.DELETED
+        live = picture.status != DELETED
         held = picture.reported[:, number]
         prior = self.fuser.share.start(Gaussian(picture.x0, picture.P0))
         x = np.where(held[:, None], picture.x[:, number], prior.x)
@@ -394,10 +395,12 @@ class Center:
         if not gone:
             return state, []
         state = state._replace(base=gone[-1].picture, base_ns=gone[-1].time_ns)
-        deleted = [checkpoint.picture.ids[checkpoint.picture.status == Status.DELETED] for checkpoint in gone]
+        deleted = [checkpoint.picture.ids[checkpoint.picture.status == DELETED] for checkpoint in gone]
+        if not any(map(len, deleted)):
+            return state, []
         ids = np.unique(np.concatenate(deleted))
         members = zip(self.names, state.members, strict=True)
-        return state, [Stop(name, ids) for name, member in members if member.joined and len(ids)]
+        return state, [Stop(name, ids) for name, member in members if member.joined]
 
     def _clear(self, state: State) -> tuple[State, list[Message]]:
         """Tell the nodes how far they may go in lockstep, and, at any speed, that all is done."""
@@ -423,24 +426,24 @@ class Center:
     def _advice(self, tracks: Tracks) -> list[Message]:
         if self.fusion.feedback == "none":
             return []
-        live = tracks.status != Status.DELETED
+        live = tracks.status != DELETED
         return [Advice(tracks.time_ns, tracks.ids[live], tracks.x[live], tracks.P[live])]
 
     def tracks(self, state: State) -> Tracks:
         """The newest picture as a message: all tracks that have started."""
         picture = state.picture
-        started = picture.starts_ns <= state.time_ns
+        picture = take(picture, picture.starts_ns <= state.time_ns)
         return Tracks(
             time_ns=state.time_ns,
             sensors=self.names,
-            ids=picture.ids[started],
-            status=picture.status[started],
-            scans=picture.scans[started],
-            contributing=picture.contributing[started],
-            log_lr=picture.log_lr[started],
-            log_lr_total=picture.log_lr_total[started],
-            x=picture.fused_x[started],
-            P=picture.fused_P[started],
+            ids=picture.ids,
+            status=picture.status,
+            scans=picture.scans,
+            contributing=picture.contributing,
+            log_lr=picture.log_lr,
+            log_lr_total=picture.log_lr_total,
+            x=picture.fused_x,
+            P=picture.fused_P,
         )
 
 

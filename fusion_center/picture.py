@@ -15,7 +15,7 @@ from common.estimation.motion import Motion
 from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
-from common.estimation.sprt import Status, StatusArray, Thresholds, decide
+from common.estimation.sprt import DELETED, TENTATIVE, StatusArray, Thresholds, decide
 from common.messages import Decision, IntArray, Report
 from common.quantities import NS_PER_S
 
@@ -164,7 +164,7 @@ class Fuser:
             x0=priors.x,
             P0=priors.P,
             times_ns=times_ns,
-            status=np.full(tracks, Status.TENTATIVE, np.uint8),
+            status=np.full(tracks, TENTATIVE, np.uint8),
             scans=np.zeros(tracks, np.int64),
             log_lr=np.zeros(tracks),
             log_lr_total=np.zeros(tracks),
@@ -182,7 +182,7 @@ class Fuser:
 
     def expect(self, picture: Picture, t_ns: int) -> Expected:
         """Work out what a picture will be at a measurement time, as far as no report is needed for it."""
-        kept = take(picture, picture.status != Status.DELETED)
+        kept = take(picture, picture.status != DELETED)
         live = kept.times_ns < t_ns
         moving = take(kept, live)
         factors, network_P = self._predict(moving, t_ns)
@@ -200,7 +200,8 @@ class Fuser:
         Returns:
             the picture at the measurement time and what was decided.
         """
-        moved, decisions = self._decide(self._move(expected, reports), expected.t_ns)
+        moved = self._move(expected, reports)
+        moved, decisions = self._decide(moved)
         return (moved if expected.live.all() else put(expected.kept, expected.live, moved)), decisions
 
     def _move(self, expected: Expected, reports: Mapping[int, Report]) -> Picture:
@@ -209,8 +210,8 @@ class Fuser:
         heard = said.who.any(axis=-1)
         after = product(Gaussian(said.x, said.P)) if heard.any() else before
         # Cumulative sums that are both -inf have not changed.
-        same = said.log_p_bar == picture.log_p_bar
-        evidence = np.where(same, 0.0, said.log_p_bar - np.where(same, 0.0, picture.log_p_bar))
+        changed = said.log_p_bar != picture.log_p_bar
+        evidence = np.subtract(said.log_p_bar, picture.log_p_bar, out=np.zeros_like(said.log_p_bar), where=changed)
         # A track that nobody reported stays as it is, to the last digit.
         step = np.where(heard, log_lambda(before, after, evidence), 0.0)
         network_P = self._shrunk(expected.network_P, reports) if self.globalised else expected.network_P
@@ -250,16 +251,18 @@ class Fuser:
             network_P[:, number] = shrink(network_P[:, number], linear.H, linear.R)
         return network_P
 
-    def _decide(self, picture: Picture, t_ns: int) -> tuple[Picture, list[Decision]]:
+    def _decide(self, picture: Picture) -> tuple[Picture, list[Decision]]:
         if self.limits is None:
             return picture, []
         verdict = decide(picture.log_lr, picture.status, self.limits)
+        if not (verdict.accepted | verdict.rejected).any():
+            return picture, []
         # Confirmed anew, a track only has its LR reset: that is monitoring, not a decision.
         decisions = [
             Decision(
                 kind="deleted" if verdict.rejected[row] else "confirmed",
                 track=int(picture.ids[row]),
-                time_ns=t_ns,
+                time_ns=int(picture.times_ns[row]),
                 log_lr=float(picture.log_lr[row]),
                 log_lr_total=float(picture.log_lr_total[row]),
                 scans=int(picture.scans[row]),
@@ -283,7 +286,7 @@ def _collect(picture: Picture, predicted: Gaussian, reports: Mapping[int, Report
 
 def _common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:
     """Where ids that both have stand in each; mostly both have the same."""
-    if len(ours) == len(theirs) and (ours == theirs).all():
+    if ours.tobytes() == theirs.tobytes():
         return slice(None), slice(None)
     _, rows, others = np.intersect1d(ours, theirs, assume_unique=True, return_indices=True)
     return rows, others

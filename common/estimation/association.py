@@ -24,6 +24,7 @@ from common.estimation.gaussian import (
     Gaussian,
     identity,
     joseph,
+    squared_norm,
     symmetric,
     times_transposed,
     whitener,
@@ -118,7 +119,7 @@ def expect(predicted: Gaussian, sensor: Linearised, clutter: Clutter) -> Expecte
     PH = times_transposed(predicted.P, sensor.H)
     white, half_log_det = whitener(symmetric(times_transposed(PH.mT, sensor.H)) + sensor.R)
     m = white.shape[-1]
-    W = PH @ white.mT
+    W = times_transposed(PH, white)
     return Expected(
         density=predicted,
         z=sensor.z,
@@ -147,8 +148,8 @@ def update(expected: Expected, plots: Plots) -> Filtered:
     if plots.valid is not None:
         # Padding may hold anything, and 0 times NaN is no zero.
         nu = np.where(plots.valid[..., None], nu, 0.0)
-    w = nu @ expected.whitener.mT
-    distance = np.vecdot(w, w)
+    w = times_transposed(nu, expected.whitener)
+    distance = squared_norm(w)
     log_pdf = expected.log_peak[..., None] - 0.5 * distance
     inside = distance[-1] <= expected.gate
     if plots.valid is not None:
@@ -230,7 +231,7 @@ def absorb(expected: Expected, w: Array, p: Array) -> Gaussian:
     rest = (hit[..., None] * w).mT @ w - mean[..., :, None] * mean[..., None, :]
     rest += p[..., 0, None, None] * identity(w.shape[-1])
     x = expected.density.x + np.matvec(W, mean)
-    return Gaussian(x, expected.P_hit + symmetric(W @ rest @ W.mT))
+    return Gaussian(x, expected.P_hit + symmetric(times_transposed(W @ rest, W)))
 
 
 def pdaf(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter) -> Filtered:

@@ -55,17 +55,15 @@ def times_transposed(P: Array, A: Array) -> Array:
     """``P A'``, shapes (..., k, n) and (m, n) or (..., m, n) to (..., k, m).
 
     A matrix that the whole batch shares takes one product; NumPy would do as many small ones as there are batches.
+    Where everyone has his own, a copy of the transposed ones pays: NumPy is slow with strides.
     """
     if A.ndim > 2:
-        return P @ A.mT
+        return P @ np.ascontiguousarray(A.mT)
     return (P.reshape(-1, P.shape[-1]) @ A.T).reshape(*P.shape[:-1], len(A))
 
 
 def gram(W: Array) -> Array:
-    """``W'W``, shape (..., k, n) to (..., n, n).
-
-    NumPy takes products with a transposed matrix slowly, so that a copy of it pays.
-    """
+    """``W'W``, shape (..., k, n) to (..., n, n)."""
     return np.ascontiguousarray(W.mT) @ W
 
 
@@ -165,7 +163,7 @@ def joseph(P: Array, K: Array, H: Array, R: Array) -> Array:
         updated covariances, shape (..., n, n).
     """
     A = identity(P.shape[-1]) - times_transposed(K, H.mT)
-    return symmetric(A @ P @ A.mT + times_transposed(K, R) @ K.mT)
+    return symmetric(times_transposed(A @ P, A) + times_transposed(times_transposed(K, R), K))
 
 
 def log_pdf(at: Array, density: Gaussian) -> Array:

@@ -19,6 +19,9 @@ class Status(IntEnum):
     DELETED = 2
 
 
+#: To compare arrays with: a member of an enumeration is slow to look up.
+TENTATIVE, CONFIRMED, DELETED = (np.uint8(status) for status in Status)
+
 StatusArray = NDArray[np.uint8]
 
 
@@ -82,9 +85,9 @@ def decide(log_lr: Array, status: StatusArray, limits: Thresholds) -> Verdict:
     Returns:
         what was decided.
     """
-    alive = status != Status.DELETED
+    alive = status != DELETED
     accepted = alive & (log_lr > limits.log_b)
     rejected = alive & (log_lr < limits.log_a)
     new = status.copy()
-    new[accepted], new[rejected] = Status.CONFIRMED, Status.DELETED
+    new[accepted], new[rejected] = CONFIRMED, DELETED
     return Verdict(np.where(accepted, 0.0, log_lr), new, accepted, rejected)

@@ -161,12 +161,12 @@ def _enter(namespace: int) -> None:
 
 
 def new_namespace() -> int:
-    """A handle of a new network namespace, with Linux's usual congestion control and without IPv6's own chatter."""
+    """A handle of a new network namespace, with the same congestion control everywhere, without IPv6's own chatter."""
     home = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
     if _libc.unshare(_CLONE_NEWNET):
         raise OSError(ctypes.get_errno(), "cannot make a network namespace")
     namespace = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
-    for setting, value in (("ipv6/conf/default/disable_ipv6", "1"), ("ipv4/tcp_congestion_control", "cubic")):
+    for setting, value in (("ipv6/conf/default/disable_ipv6", "1"), ("ipv4/tcp_congestion_control", "reno")):
         with suppress(OSError):
             Path("/proc/sys/net", setting).write_text(value)
     _ip("link set lo up")

@@ -42,13 +42,17 @@ class _Model(BaseModel):
 
 
 class Network(_Model):
-    """How one process takes part in a Zenoh network; endpoints look like ``tcp/192.168.1.7:7447``."""
+    """How one process takes part in a Zenoh network; endpoints look like ``tcp/192.168.1.7:7447``.
+
+    ``link_bit_s`` is the rate of its slowest link, where that is below some Mbit/s: reports then overtake plots there.
+    """
 
     name: Name = "waldnet"
     mode: Literal["peer", "client", "router"] = "peer"
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
     multicast: bool = False
+    link_bit_s: Positive | None = None
 
 
 class Origin(_Model):

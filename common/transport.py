@@ -1,7 +1,10 @@
 """The network behind one small interface: publish, subscribe, announce, watch, answer, ask.
 
-Two implementations behave alike: ``open_zenoh`` joins processes over a network, ``MemoryNetwork`` joins buses within
-one process. No other module imports zenoh.
+``open_zenoh`` joins processes over a network. No other module imports zenoh; ``common.memory`` behaves alike in one
+process.
+
+Reports, commands and what else is reliable go before what is only displayed: it has Zenoh's lowest priority, every put
+of it is numbered, and where the link's rate is known it takes only what the rest leaves over.
 """
 
 from __future__ import annotations
@@ -12,7 +15,6 @@ import logging
 import re
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple, Protocol, Self
@@ -21,12 +23,16 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import FifoChannel
 
+from common.allowance import Allowance
 from common.config import Network
 from common.errors import TransportError
 
 # Both are called on a transport thread and must only enqueue.
 Deliver = Callable[[str, bytes], None]  # key, payload
 DeliverPresence = Callable[[str, bool], None]  # liveliness key, alive
+DeliverMiss = Callable[[str, int], None]  # key, number of samples
+
+KeyExpr = zenoh.KeyExpr
 
 CONNECT_TIMEOUT_S = 5.0  # so long a client waits for a router or center that starts at the same time
 
@@ -36,7 +42,11 @@ _LEASE_MS = 5000
 # stalls the link; the sender then drops, and recovery or a miss report follows.
 _CHANNEL_SIZE = 10_000
 _DROP = zenoh.CongestionControl.DROP
-_HEARTBEAT = ext.MissDetectionConfig(heartbeat=0.5, sporadic_heartbeat=None)
+#: What Zenoh itself can hold of one priority on a link of known rate, in batches; 16 is the most there is.
+_QUEUE = {"data": 16, "background": 16}
+# So often a publisher says how far it is: what was lost last is noticed then, after a cut too. A sporadic heartbeat
+# would save these 60 bytes a second, but one that is lost with its link is not repeated.
+_HEARTBEAT = ext.MissDetectionConfig(heartbeat=2.0, sporadic_heartbeat=None)
 _RECOVERY = ext.RecoveryConfig(periodic_queries=None, heartbeat=True)
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic)/(\[[^\s\]]+\]|[^\s/:\[\]?#]+):(?P<port>\d{1,5})([?#]\S*)?")
 
@@ -46,8 +56,12 @@ _log = logging.getLogger(__name__)
 class Publisher(Protocol):
     """Publishes on one key."""
 
-    def put(self, payload: bytes) -> None:
-        """Send without waiting: what a full link cannot take is dropped."""
+    def put(self, payload: bytes) -> bool:
+        """Send without waiting: what a full link cannot take is dropped.
+
+        Returns:
+            False if display data was shed here, for the rest's sake; what Zenoh drops, only the receiver notices.
+        """
 
     @property
     def has_listeners(self) -> bool:
@@ -67,7 +81,7 @@ class Bus(Protocol):
         Args:
             key: what to publish on.
             cache: samples kept for recovery and for late subscribers, if reliable.
-            reliable: whether losses are noticed and repaired; display data needs neither, its next sample will do.
+            reliable: whether losses are repaired; display data needs no repair and comes after everything else.
         """
 
     def subscribe(
@@ -77,16 +91,17 @@ class Bus(Protocol):
         *,
         reliable: bool = True,
         history: int = 0,
-        on_miss: Callable[[str, int], None] | None = None,
+        on_miss: DeliverMiss | None = None,
     ) -> None:
         """Have every sample delivered from now on.
 
         Args:
             key_expr: what to listen to; ``*`` stands for one chunk, ``**`` for any number.
             deliver: takes key and payload.
-            reliable: ask reliable publishers again for samples that were lost.
+            reliable: ask reliable publishers again for samples that were lost; False for display data.
             history: most samples to fetch from the cache of each reliable publisher, present or yet to come.
             on_miss: takes key and number of samples lost for good; ``key_expr`` if nothing of that publisher arrived.
+                Of display data, the exact number shed between two samples, told just before the second.
         """
 
     def announce(self, key: str) -> None:
@@ -134,7 +149,7 @@ def open_zenoh(network: Network) -> Bus:
     _check_endpoints(network)
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # silent unless RUST_LOG is set
     session = _open_session(network)
-    return _ZenohBus(session, _listening(session, network))
+    return _ZenohBus(session, _listening(session, network), Allowance(network.link_bit_s))
 
 
 def _port(endpoint: str) -> int:
@@ -180,7 +195,21 @@ def _settings(network: Network) -> dict[str, Any]:
         "open": {"return_conditions": {"connect_scouted": False}},
         # The one way to learn a port the system chose; everyone in reach can read it, so fixed ports leave it off.
         "adminspace": {"enabled": 0 in map(_port, network.listen)},
-        "transport": {"link": {"tx": {"lease": _LEASE_MS}}, "shared_memory": {"enabled": False}},
+        "transport": {"link": _link_settings(network.link_bit_s), "shared_memory": {"enabled": False}},
+    }
+
+
+def _link_settings(bit_s: float | None) -> dict[str, Any]:
+    """Buffers that hold about a second of a slow link: what is in them, no priority overtakes.
+
+    A sending buffer alone does not bound what is on its way: the kernel lets the last packet grow. The receiver's does.
+    """
+    if bit_s is None:
+        return {"tx": {"lease": _LEASE_MS}}
+    second = min(max(round(bit_s / 8.0), 4096), 1 << 20)
+    return {
+        "tx": {"lease": _LEASE_MS, "batch_size": min(second // 4, 49152), "queue": {"size": _QUEUE}},
+        "tcp": {"so_rcvbuf": second, "so_sndbuf": second // 2},
     }
 
 
@@ -207,7 +236,12 @@ def _reason(error: zenoh.ZError) -> str:
 
 
 @contextmanager
-def _explained(doing: str) -> Iterator[None]:
+def explained(doing: str) -> Iterator[None]:
+    """Say what was being done when Zenoh refused.
+
+    Raises:
+        TransportError: in place of Zenoh's own error.
+    """
     try:
         yield
     except zenoh.ZError as error:
@@ -217,22 +251,45 @@ def _explained(doing: str) -> Iterator[None]:
 class _ZenohPublisher(NamedTuple):
     key: str
     plain: zenoh.Publisher
-    sender: zenoh.Publisher | ext.AdvancedPublisher
+    sender: ext.AdvancedPublisher
+    allowance: Allowance
 
-    def put(self, payload: bytes) -> None:
-        with _explained(f"publish on {self.key}"):
+    def put(self, payload: bytes) -> bool:
+        self.allowance.spend(len(payload))
+        with explained(f"publish on {self.key}"):
             self.sender.put(payload)
+        return True
 
     @property
     def has_listeners(self) -> bool:
-        status: Any = self.plain.matching_status  # the stub says bool; it is an object, always true
-        return bool(status.matching)
+        return _matching(self.plain)
+
+
+class _DisplayPublisher:
+    def __init__(self, key: str, plain: zenoh.Publisher, allowance: Allowance) -> None:
+        self._key, self._plain, self._allowance, self._number = key, plain, allowance, 0
+
+    def put(self, payload: bytes) -> bool:
+        self._number += 1
+        if not self._allowance.grants(len(payload)):
+            return False
+        with explained(f"publish on {self._key}"):
+            self._plain.put(payload, attachment=self._number.to_bytes(4, "little"))
+        return True
+
+    @property
+    def has_listeners(self) -> bool:
+        return _matching(self._plain)
+
+
+def _matching(publisher: zenoh.Publisher) -> bool:
+    status: Any = publisher.matching_status  # the stub says bool; it is an object, always true
+    return bool(status.matching)
 
 
 class _ZenohBus(Bus):
-    def __init__(self, session: zenoh.Session, endpoints: tuple[str, ...]) -> None:
-        self._session = session
-        self._endpoints = endpoints
+    def __init__(self, session: zenoh.Session, endpoints: tuple[str, ...], allowance: Allowance) -> None:
+        self._session, self._endpoints, self._allowance = session, endpoints, allowance
         # Zenoh withdraws what nobody refers to. Its close() ends publishers, even amid a put() where undeclare() fails,
         # but not advanced subscribers: the stack undeclares all else.
         self._publishers: list[Publisher] = []
@@ -243,11 +300,11 @@ class _ZenohBus(Bus):
         self._closing.callback(atexit.unregister, self.close)
 
     def publisher(self, key: str, *, cache: int = 50, reliable: bool = True) -> Publisher:
-        with _explained(f"publish on {key}"):
-            plain = self._session.declare_publisher(key, congestion_control=_DROP)
-            sender: zenoh.Publisher | ext.AdvancedPublisher = plain
+        publisher: Publisher
+        with explained(f"publish on {key}"):
             if reliable:
                 # An advanced publisher cannot tell whether anyone listens: the plain one beside it does.
+                plain = self._session.declare_publisher(key, congestion_control=_DROP)
                 sender = ext.declare_advanced_publisher(
                     self._session,
                     key,
@@ -256,7 +313,12 @@ class _ZenohBus(Bus):
                     sample_miss_detection=_HEARTBEAT,
                     publisher_detection=True,
                 )
-        self._publishers.append(publisher := _ZenohPublisher(key, plain, sender))
+                publisher = _ZenohPublisher(key, plain, sender, self._allowance)
+            else:
+                last = zenoh.Priority.BACKGROUND
+                plain = self._session.declare_publisher(key, congestion_control=_DROP, priority=last)
+                publisher = _DisplayPublisher(key, plain, self._allowance)
+        self._publishers.append(publisher)
         return publisher
 
     def subscribe(
@@ -266,9 +328,17 @@ class _ZenohBus(Bus):
         *,
         reliable: bool = True,
         history: int = 0,
-        on_miss: Callable[[str, int], None] | None = None,
+        on_miss: DeliverMiss | None = None,
     ) -> None:
-        assert reliable or (not history and on_miss is None), "history and misses need reliable=True"
+        assert reliable or not history, "history needs reliable=True"
+        with explained(f"subscribe to {key_expr}"):
+            if reliable:
+                self._subscribe_reliably(key_expr, deliver, history, on_miss)
+            else:
+                display = self._session.declare_subscriber(key_expr, FifoChannel(_CHANNEL_SIZE))
+                self._serve(display, _Display(deliver, on_miss))
+
+    def _subscribe_reliably(self, key_expr: str, deliver: Deliver, history: int, on_miss: DeliverMiss | None) -> None:
         keys: dict[tuple[str, int], str] = {}  # a miss names its publisher, not the key
 
         def on_sample(sample: zenoh.Sample) -> None:
@@ -277,31 +347,27 @@ class _ZenohBus(Bus):
                 keys[_identity(sample.source_info.source_id)] = key
             deliver(key, sample.payload.to_bytes())
 
-        with _explained(f"subscribe to {key_expr}"):
-            if not reliable:
-                self._serve(self._session.declare_subscriber(key_expr, FifoChannel(_CHANNEL_SIZE)), on_sample)
-                return
-            subscriber = ext.declare_advanced_subscriber(
-                self._session,
-                key_expr,
-                FifoChannel(_CHANNEL_SIZE),
-                history=ext.HistoryConfig(detect_late_publishers=True, max_samples=history) if history else None,
-                recovery=_RECOVERY,
-            )
-            self._serve(subscriber, on_sample)
-            if on_miss is not None:
-                misses = subscriber.sample_miss_listener(FifoChannel(_CHANNEL_SIZE))
-                self._serve(misses, lambda miss: on_miss(keys.get(_identity(miss.source), key_expr), miss.nb))
+        subscriber = ext.declare_advanced_subscriber(
+            self._session,
+            key_expr,
+            FifoChannel(_CHANNEL_SIZE),
+            history=ext.HistoryConfig(detect_late_publishers=True, max_samples=history) if history else None,
+            recovery=_RECOVERY,
+        )
+        self._serve(subscriber, on_sample)
+        if on_miss is not None:
+            misses = subscriber.sample_miss_listener(FifoChannel(_CHANNEL_SIZE))
+            self._serve(misses, lambda miss: on_miss(keys.get(_identity(miss.source), key_expr), miss.nb))
 
     def announce(self, key: str) -> None:
-        with _explained(f"announce {key}"):
+        with explained(f"announce {key}"):
             self._closing.callback(self._session.liveliness().declare_token(key).undeclare)
 
     def watch(self, key_expr: str, deliver: DeliverPresence) -> None:
         def on_token(sample: zenoh.Sample) -> None:
             deliver(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        with _explained(f"watch {key_expr}"):
+        with explained(f"watch {key_expr}"):
             liveliness = self._session.liveliness()
             self._serve(liveliness.declare_subscriber(key_expr, FifoChannel(_CHANNEL_SIZE), history=True), on_token)
 
@@ -310,12 +376,12 @@ class _ZenohBus(Bus):
             with query:
                 query.reply(key, reply())
 
-        with _explained(f"answer {key}"):
+        with explained(f"answer {key}"):
             self._serve(self._session.declare_queryable(key, FifoChannel(_CHANNEL_SIZE)), on_query)
 
     def ask(self, key_expr: str, timeout_s: float) -> list[tuple[str, bytes]]:
         every_one = zenoh.ConsolidationMode.NONE
-        with _explained(f"ask {key_expr}"):
+        with explained(f"ask {key_expr}"):
             replies = self._session.get(key_expr, consolidation=every_one, timeout=timeout_s)
             return [(str(r.ok.key_expr), r.ok.payload.to_bytes()) for r in replies if r.ok is not None]
 
@@ -346,117 +412,19 @@ def _identity(source: zenoh.EntityGlobalId) -> tuple[str, int]:
     return str(source.zid), source.eid
 
 
-class MemoryNetwork:
-    """Joins buses within one process; what is sent is delivered on the sender's thread before it goes on."""
+class _Display:
+    """Delivers display data, and tells of the gaps in its numbers; a publisher that begins anew has none."""
 
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.declared: list[_Declaration] = []
+    def __init__(self, deliver: Deliver, on_miss: DeliverMiss | None) -> None:
+        self._deliver, self._on_miss = deliver, on_miss
+        self._numbers: dict[str, int] = {}
 
-    def bus(self) -> Bus:
-        """Return a new bus that reaches all the others."""
-        return _MemoryBus(self)
-
-    def matching(self, kind: str, key_expr: str) -> list[_Declaration]:
-        """Return what open buses have declared, oldest first."""
-        expr = zenoh.KeyExpr(key_expr)
-        with self.lock:
-            return [d for d in self.declared if d.kind == kind and d.key_expr.intersects(expr)]
-
-    def tell(self, key: str, *, alive: bool) -> None:
-        """Tell every watch of a token."""
-        for watch in self.matching("watch", key):
-            watch.item(key, alive)
-
-
-class _Declaration(NamedTuple):
-    bus: Bus
-    kind: str
-    key_expr: zenoh.KeyExpr
-    item: Any  # a publisher's cache, a callback, or nothing for a token
-
-
-class _MemoryPublisher(NamedTuple):
-    bus: _MemoryBus
-    key: str
-    cache: deque[bytes]
-
-    def put(self, payload: bytes) -> None:
-        with self.bus.doing(f"publish on {self.key}") as network:
-            self.cache.append(payload)
-            for subscriber in network.matching("subscriber", self.key):
-                subscriber.item(self.key, payload)
-
-    @property
-    def has_listeners(self) -> bool:
-        return not self.bus.closed and bool(self.bus.network.matching("subscriber", self.key))
-
-
-class _MemoryBus(Bus):
-    def __init__(self, network: MemoryNetwork) -> None:
-        self.network = network
-        self.closed = False
-
-    @contextmanager
-    def doing(self, what: str) -> Iterator[MemoryNetwork]:
-        with self.network.lock, _explained(what):
-            if self.closed:
-                raise zenoh.ZError("session closed")
-            yield self.network
-
-    def _declare(self, kind: str, key_expr: str, item: Any = None) -> None:
-        with self.doing(f"declare {kind} {key_expr}") as network:
-            network.declared.append(_Declaration(self, kind, zenoh.KeyExpr(key_expr), item))
-
-    def publisher(self, key: str, *, cache: int = 50, reliable: bool = True) -> Publisher:
-        publisher = _MemoryPublisher(self, key, deque(maxlen=cache if reliable else 0))
-        self._declare("publisher", key, publisher.cache)
-        return publisher
-
-    def subscribe(
-        self,
-        key_expr: str,
-        deliver: Deliver,
-        *,
-        reliable: bool = True,
-        history: int = 0,
-        on_miss: Callable[[str, int], None] | None = None,
-    ) -> None:
-        assert reliable or (not history and on_miss is None), "history and misses need reliable=True"
-        with self.network.lock:
-            self._declare("subscriber", key_expr, deliver)
-            for publisher in self.network.matching("publisher", key_expr):
-                for payload in list(publisher.item)[-history:] if history else ():
-                    deliver(str(publisher.key_expr), payload)
-
-    def announce(self, key: str) -> None:
-        with self.network.lock:
-            self._declare("token", key)
-            if len(self.network.matching("token", key)) == 1:
-                self.network.tell(key, alive=True)
-
-    def watch(self, key_expr: str, deliver: DeliverPresence) -> None:
-        with self.network.lock:
-            self._declare("watch", key_expr, deliver)
-            for key in dict.fromkeys(str(token.key_expr) for token in self.network.matching("token", key_expr)):
-                deliver(key, True)  # noqa: FBT003
-
-    def answer(self, key: str, reply: Callable[[], bytes]) -> None:
-        self._declare("answer", key, reply)
-
-    def ask(self, key_expr: str, timeout_s: float) -> list[tuple[str, bytes]]:  # noqa: ARG002
-        with self.doing(f"ask {key_expr}") as network:
-            answers = network.matching("answer", key_expr)
-        return [(str(answer.key_expr), answer.item()) for answer in answers]
-
-    def endpoints(self) -> tuple[str, ...]:
-        return ()
-
-    def close(self) -> None:
-        with self.network.lock:
-            self.closed = True
-            mine = [d for d in self.network.declared if d.bus is self]
-            self.network.declared = [d for d in self.network.declared if d.bus is not self]
-            for key in {str(d.key_expr) for d in mine if d.kind == "token"}:
-                if not self.network.matching("token", key):
-                    self.network.tell(key, alive=False)
+    def __call__(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        if sample.attachment is not None:
+            number = int.from_bytes(sample.attachment.to_bytes(), "little")
+            missed = number - self._numbers.get(key, number) - 1
+            if self._on_miss is not None and missed > 0:
+                self._on_miss(key, missed)
+            self._numbers[key] = number
+        self._deliver(key, sample.payload.to_bytes())

@@ -12,7 +12,7 @@ from common.codec import decode
 from common.config import Network, Scenario
 from common.errors import DecodeError
 from common.estimation.sprt import Status
-from common.inbox import Exited, Heard, Inbox, Incoming, Present, Said, Stopped
+from common.inbox import Exited, Heard, Inbox, Incoming, Missed, Present, Said, Stopped
 from common.messages import NEVER, Clock, Decision, Keys, Tracks, sensor_of
 from common.process import stopped_by_signals
 from common.transport import Bus, open_zenoh
@@ -91,7 +91,7 @@ class Run:
     def _watch(self, bus: Bus) -> None:
         for key in (self._keys.tracks(), self._keys.decision(), self._keys.clock()):
             bus.subscribe(key, self._inbox.heard, history=200)
-        bus.subscribe(self._keys.plots(), self._inbox.heard, reliable=False)
+        bus.subscribe(self._keys.plots(), self._inbox.heard, reliable=False, on_miss=self._inbox.missed)
         bus.watch(self._keys.sensor_alive(), self._inbox.present)
 
     def _start_center(self, here: tuple[str, ...]) -> None:
@@ -136,6 +136,8 @@ class Run:
                 self._hear(key, payload)
             case Present(key, alive):
                 self._status.present(sensor_of(key), alive)
+            case Missed(key, number):
+                self._plots_shed(sensor_of(key), number)
             case Said(name, listening) if name == CENTER:
                 self._start_sensors(listening)
             case Exited(name, code):
@@ -163,6 +165,12 @@ class Run:
                 self._finished = message.clear_ns == NEVER
             case _:
                 pass
+
+    def _plots_shed(self, sensor: str, number: int) -> None:
+        shed = self.record.plots_shed
+        if sensor not in shed:
+            self._status.say(f"{sensor}: not all plots are shown, its link is full: reports go first", "yellow")
+        shed[sensor] = shed.get(sensor, 0) + number
 
     def _child_ended(self, name: str, code: int) -> None:
         how = describe_exit(code)
@@ -195,4 +203,7 @@ def execute(order: Order, console: Console) -> None:
         files = write_report(run.record, order.out, {"seed": order.seed, "speed": order.speed or "max"})
         last = [Status(int(history.status[-1])) for history in run.record.histories().values()]
         outcome = ", ".join(f"{last.count(status)} {status.name.lower()}" for status in Status)
+        if run.record.plots_shed:
+            shed = ", ".join(f"{number} of {sensor}" for sensor, number in sorted(run.record.plots_shed.items()))
+            console.print(f"scans not shown because a link was full: {shed}", soft_wrap=True)
         console.print(f"tracks: {outcome}\nreport: {', '.join(str(file) for file in files)}", soft_wrap=True)

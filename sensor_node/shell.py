@@ -241,8 +241,8 @@ class NodeShell:
         self._state, report = self._tracker.scan(self._state, scan, self._next_ns())
         self._publish(report)
         self._reported_s = time.monotonic()
-        if self._publishers[self._keys.plots(self._name)].has_listeners:
-            self._publish(scan)
+        if self._publishers[self._keys.plots(self._name)].has_listeners and not self._publish(scan):
+            self.complaints.add("plots shed", "the link is full: reports go first, these plots are not shown")
 
     def _done(self) -> bool:
         """All scans are sent, and the center has them all or is no more."""
@@ -255,6 +255,6 @@ class NodeShell:
     def _exhausted(self) -> bool:
         return self._position == len(self._scans)
 
-    def _publish(self, message: Message) -> None:
+    def _publish(self, message: Message) -> bool:
         payload = encode(message, rounded=self._tracker.rounded)
-        self._publishers[self._keys.of(message)].put(payload)
+        return self._publishers[self._keys.of(message)].put(payload)

@@ -8,8 +8,9 @@ from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
 from common.codec import decode
 from common.config import Scenario
 from common.inbox import Heard, Inbox
+from common.memory import MemoryNetwork
 from common.messages import Keys, Scan
-from common.transport import Bus, MemoryNetwork
+from common.transport import Bus
 from fusion_center.center import Center
 from fusion_center.shell import CenterShell
 from sensor_node.shell import NodeShell

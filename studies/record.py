@@ -46,6 +46,7 @@ class Record:
         decisions: in the order they were made.
         scans: the plots as the sensors published them.
         lost: why sensors went before their end, by name.
+        plots_shed: scans missing among those that came, by sensor: full links carry reports first.
     """
 
     scenario: Scenario
@@ -53,6 +54,7 @@ class Record:
     decisions: list[Decision] = field(default_factory=list)
     scans: list[Scan] = field(default_factory=list)
     lost: dict[str, str] = field(default_factory=dict)
+    plots_shed: dict[str, int] = field(default_factory=dict)
 
     def note(self, message: Message) -> None:
         """Keep a message that belongs to the record."""
@@ -112,6 +114,7 @@ class Record:
             ],
             "withdrawn": [decision_entry(d, self.scenario) for d in self.decisions if d.kind == "withdrawn"],
             "sensors_lost": dict(self.lost),
+            "plots_shed": dict(self.plots_shed),
         }
 
 

@@ -18,8 +18,8 @@ from common.codec import encode
 from common.config import load_scenario
 from common.errors import ConfigError, WaldnetError
 from common.estimation.sprt import Status
+from common.memory import MemoryNetwork
 from common.messages import Decision, Keys, Scan, Start, Tracks
-from common.transport import MemoryNetwork
 from fusion_center.center import Center
 from fusion_center.shell import CenterShell
 from launch.status import LiveStatus

@@ -18,7 +18,8 @@ import pytest
 from common import transport
 from common.config import Network
 from common.errors import TransportError
-from common.transport import Bus, MemoryNetwork, Publisher, open_zenoh
+from common.memory import MemoryNetwork
+from common.transport import Bus, Publisher, open_zenoh
 
 PATIENCE_S = 20
 ANY_PORT = "tcp/127.0.0.1:0"
@@ -414,6 +415,66 @@ def test_losses_beyond_the_cache_are_reported(join_zenoh: Join, monkeypatch: pyt
         assert key == "net/report"
         lost += count
     assert lost == 300 - len(received) > 0
+
+
+SLOW = 64_000.0
+
+
+def test_display_data_beyond_a_known_rate_is_shed_and_counted_on_both_sides() -> None:
+    inbox, misses, fence = Inbox(), Inbox(), Inbox()
+    with open_zenoh(Network(listen=(ANY_PORT,), link_bit_s=SLOW)) as display:
+        display.subscribe("net/*/plots", inbox, reliable=False, on_miss=misses)
+        display.subscribe("net/fence", fence)
+        display.announce("net/display")
+        with open_zenoh(Network(connect=display.endpoints(), link_bit_s=SLOW)) as sensor:
+            await_presence(sensor, "net/display")
+            plots, reports = sensor.publisher("net/a/plots", reliable=False), sensor.publisher("net/fence")
+            sent = []
+            while len(sent) < 3:
+                n = len(sent)
+                shed = 0
+                while not plots.put(b"%d" % n + bytes(5000)):
+                    assert reports.put(b"report")
+                    shed += 1
+                    time.sleep(0.01)
+                sent.append(shed)
+            taken = [payload[:1] for _, payload in inbox.take(3)]
+    assert taken == [b"0", b"1", b"2"]
+    assert sent[0] == 0
+    assert misses.rest() == [("net/a/plots", shed) for shed in sent[1:]]
+    assert len(fence.rest()) == sum(sent)
+
+
+def test_display_data_lost_on_the_way_is_told_exactly(join_zenoh: Join, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transport, "_CHANNEL_SIZE", 1)
+    center, sensor = join_zenoh(), join_zenoh()
+    stuck, go_on = threading.Event(), threading.Event()
+    inbox, misses = Inbox(), Inbox()
+
+    def deliver(key: str, payload: bytes) -> None:
+        inbox(key, int(payload[:4]))
+        stuck.set()
+        assert go_on.wait(PATIENCE_S)
+
+    center.subscribe("net/*", deliver, reliable=False, on_miss=misses)
+    center.announce("net/center")
+    await_presence(sensor, "net/center")
+    publisher = sensor.publisher("net/plots", reliable=False)
+    publisher.put(b"%04d" % 0)
+    assert stuck.wait(PATIENCE_S)
+    for n in range(1, 300):
+        publisher.put(b"%04d" % n + bytes(100_000))
+    go_on.set()
+    received = [n for _, n in inbox.take(1)]
+    for n in range(300, 10_000):
+        publisher.put(b"%04d" % n)
+        received += [n for _, n in inbox.rest()]
+        if received[-1] >= 300:
+            break
+        time.sleep(0.01)
+    center.close()
+    received += [n for _, n in inbox.rest()]
+    assert 0 < sum(n for _, n in misses.rest()) == received[-1] + 1 - len(received)
 
 
 def test_a_failing_callback_is_logged_and_the_next_sample_comes(

@@ -178,6 +178,8 @@ def watch(
 ) -> None:
     """Print the decisions of a running network, and who comes and goes, until Ctrl-C.
 
+    Over a router it sees all who come and go; connected to the center itself, the center only.
+
     Args:
         scenario: scenario file, or name of one that comes along; for the network's name and the epoch of times.
         options: the network.

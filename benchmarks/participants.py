@@ -35,10 +35,11 @@ class TimedNode(NodeShell):
         self._began_at = time.monotonic_ns()
         super()._process(scan)
 
-    def _publish(self, message: Message) -> None:
-        super()._publish(message)
+    def _publish(self, message: Message) -> bool:
+        sent = super()._publish(message)
         if isinstance(message, Report):
             self.stamps.append((message.time_ns, self._began_at, time.monotonic_ns()))
+        return sent
 
 
 class TimedCenter(CenterShell):

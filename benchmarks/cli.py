@@ -36,6 +36,7 @@ def latency(
     """
     from benchmarks.latency import Cell, measure, table
 
+    _writable(json_file)
     rows = []
     for number in sensors:
         for many in tracks:
@@ -71,6 +72,7 @@ def bandwidth(
     """
     from benchmarks.bandwidth import draw, measure, table, worlds
 
+    _writable(json_file, figure)
     rows = [_say(row) for row in measure(worlds(tracks, sensors, false_plots), scans, interval)]
     if figure is not None:
         draw(rows, figure)
@@ -87,8 +89,16 @@ def precision(*, scans: Count = 1000, json_file: Annotated[Path | None, Paramete
     """
     from benchmarks.precision import SCENARIOS, compare, table
 
+    _writable(json_file)
     rows = [_say(compare(name, max(1, scans // 5) if name == "thirty-two" else scans)) for name in SCENARIOS]
     _finish(rows, table(rows), json_file, "numpy")
+
+
+def _writable(*files: Path | None) -> None:
+    """Fail now rather than after minutes of measuring."""
+    for file in files:
+        if file is not None:
+            file.open("a").close()
 
 
 def _say(row: dict[str, Any]) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import IO, Any, Self
 
@@ -66,7 +66,7 @@ class Member:
 
 
 class Crew:
-    """All processes of a benchmark; a context manager that ends them."""
+    """All processes of a benchmark, and its own connections to them; a context manager that ends them."""
 
     def __init__(self) -> None:
         """Nobody yet."""
@@ -77,6 +77,10 @@ class Crew:
         member = Member(argv, within)
         self._members.callback(member.end)
         return member
+
+    def will(self, close: Callable[[], object]) -> None:
+        """Have something closed at the end, whatever the end: Zenoh must be, or the interpreter does not."""
+        self._members.callback(close)
 
     def __enter__(self) -> Self:
         return self

@@ -134,6 +134,7 @@ class Ours:
         self._clock: Clock | None = None
         self._watch = Watch(self._scenario.to_ns(cell.world.interval_s * cell.world.scans))
         self._bus = open_zenoh(Network(name=self._scenario.network.name, connect=(self._at,)))
+        crew.will(self._bus.close)
         keys = Keys(self._scenario.network.name)
         self._bus.subscribe(keys.clock(), self._hear_clock)
         self._bus.subscribe(keys.tracks(), self._hear_tracks)
@@ -155,7 +156,6 @@ class Ours:
             {time_ns: (began, out) for time_ns, began, out in node.hear()["node"]} for node in self._nodes
         ]
         stamps = self._center.hear()
-        self._bus.close()
         came, published = dict(stamps["came"]), dict(stamps["center"])
         parts: dict[str, list[float]] = {"total": [], "node": [], "wire": [], "center": []}
         for time_ns, arrived in sorted(self._watch.arrivals.items())[_WARM_UP:]:
@@ -192,6 +192,7 @@ class Raw:
         where = str(self._relay.hear())
         self._watch = Watch(self._cycles - 1)
         self._link = link_to(kind, where, lambda message: self._watch.note(number_of(message), time.monotonic_ns()))
+        crew.will(self._link.close)
         interval_ns = round(1e9 / cell.rate) if cell.rate else 0
         arguments = (kind, where, str(report), str(interval_ns), str(self._cycles))
         self._senders: list[Member] = [crew.start("benchmarks.raw", "sender", *arguments) for _ in range(cell.sensors)]
@@ -207,7 +208,6 @@ class Raw:
         """Wait for the end; returns microseconds of every cycle."""
         stamps = [sender.hear() for sender in self._senders]
         self._watch.wait(_PATIENCE_S)
-        self._link.close()
         began = np.max(stamps, axis=0)
         return [(self._watch.arrivals[number] - int(began[number])) / 1e3 for number in range(_WARM_UP, self._cycles)]
 

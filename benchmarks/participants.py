@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections import deque
 
 from benchmarks.worlds import World
 from common.config import Network
@@ -19,7 +20,7 @@ from common.logs import configure
 from common.messages import Message, Report, Scan, Tracks
 from common.process import stopped_by_signals
 from common.transport import open_zenoh
-from fusion_center.center import Center
+from fusion_center.center import Center, Event
 from fusion_center.shell import CenterShell
 from sensor_node.shell import NodeShell
 from sensor_node.tracker import LocalTracker
@@ -43,9 +44,17 @@ class TimedNode(NodeShell):
 
 
 class TimedCenter(CenterShell):
-    """Notes for every picture: its time, and when it was out."""
+    """Notes for every picture its time and when it was out, and for every time when the last report came in."""
 
     stamps: list[tuple[int, int]]
+    came: dict[int, int]
+    arrivals: deque[int]
+
+    def _step(self, event: Event) -> None:
+        if isinstance(event, Report):
+            at = self.arrivals.popleft()
+            self.came[event.time_ns] = max(at, self.came.get(event.time_ns, 0))
+        super()._step(event)
 
     def _publish(self, message: Message) -> None:
         super()._publish(message)
@@ -54,18 +63,17 @@ class TimedCenter(CenterShell):
 
 
 class TimedInbox(Inbox):
-    """Notes when each report came in."""
+    """Notes when each report came in, in the order in which they are worked off."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.stamps: list[tuple[bytes, int]] = []
+        self.arrivals: deque[int] = deque()
 
     def heard(self, key: str, payload: bytes) -> None:
         """Put bytes."""
-        now = time.monotonic_ns()
-        super().heard(key, payload)
         if key.endswith("/report"):
-            self.stamps.append((payload, now))
+            self.arrivals.append(time.monotonic_ns())
+        super().heard(key, payload)
 
 
 def node(world: World, name: str, center: str) -> dict[str, object]:
@@ -83,8 +91,6 @@ def node(world: World, name: str, center: str) -> dict[str, object]:
 
 def center(world: World, speed: float) -> dict[str, object]:
     """Run the center to its end; returns its stamps."""
-    from common.codec import decode
-
     scenario = world.scenario()
     network = Network(name=scenario.network.name, listen=("tcp/127.0.0.1:0",))
     inbox = TimedInbox()
@@ -92,14 +98,9 @@ def center(world: World, speed: float) -> dict[str, object]:
         print(json.dumps({"listening": bus.endpoints()}), flush=True)
         fusion = Center.of(scenario, speed=speed, wait_s=60.0, first_epoch=time.time_ns())
         shell = TimedCenter(bus, network, scenario, fusion, inbox=inbox)
-        shell.stamps = []
+        shell.stamps, shell.came, shell.arrivals = [], {}, inbox.arrivals
         shell.run()
-    came: dict[int, int] = {}
-    for payload, at in inbox.stamps:
-        message = decode("waldnet/bench/sensor/any/report", payload)
-        assert isinstance(message, Report)
-        came[message.time_ns] = max(at, came.get(message.time_ns, 0))
-    return {"center": shell.stamps, "came": list(came.items())}
+    return {"center": shell.stamps, "came": list(shell.came.items())}
 
 
 def main() -> None:

@@ -123,4 +123,6 @@ def main(app: App, tokens: list[str] | None = None) -> Any:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except OSError as error:
         print(f"{error.filename or 'waldnet'}: {error.strerror}", file=sys.stderr)  # noqa: T201
+    except KeyboardInterrupt:
+        sys.exit(128 + signal.SIGINT)
     sys.exit(1)

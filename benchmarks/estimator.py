@@ -33,7 +33,7 @@ from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import thresholds
 from common.messages import NEVER, Report
 from common.quantities import NS_PER_S
-from fusion_center.picture import Fuser
+from fusion_center.picture import Fuser, Heard
 
 BATCHES = (1, 10, 100, 1000)
 PLOTS, SENSORS = 6, 4
@@ -99,7 +99,8 @@ def center_scan(tracks: int) -> Callable[[], object]:
     picture = fuser.begin(fuser.empty(), ids, now, prior)
     x, P, log_g = prior.x + 10.0, 0.5 * SENSORS * prior.P, np.ones(tracks)
     later = round(DT * NS_PER_S)
-    reports = {s: Report(str(s), 0, later, NEVER, 1, ids, np.ones_like(ids), log_g, x, P) for s in range(SENSORS)}
+    report = Report("", 0, later, NEVER, 1, ids, np.ones_like(ids), log_g, x, P)
+    reports = {number: Heard.of(report) for number in range(SENSORS)}
     return lambda: fuser.advance(fuser.expect(picture, later), reports)
 
 

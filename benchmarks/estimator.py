@@ -157,9 +157,13 @@ def measure() -> dict[str, Any]:
                 "stone_soup_over_pdaf": round(soup / factor, 1),
             }
         )
+    return {"machine": machine(), "plots": PLOTS, "sensors": SENSORS, "rows": rows}
+
+
+def machine() -> dict[str, Any]:
+    """Processor and versions."""
     versions = {name: version(name) for name in ("numpy", "scipy", "stonesoup")}
-    machine = {"cpu": _cpu(), "cores": os.cpu_count(), "python": platform.python_version(), **versions}
-    return {"machine": machine, "plots": PLOTS, "sensors": SENSORS, "rows": rows}
+    return {"cpu": _cpu(), "cores": os.cpu_count(), "python": platform.python_version(), **versions}
 
 
 def _cpu() -> str:

@@ -233,10 +233,12 @@ class Center:
         return state, [*messages, *clock, *released, *clear]
 
     def prepare(self, state: State) -> State:
-        """Work out ahead what the next measurement time will need, unless that is done or none is known."""
+        """Work out ahead what the next measurement time will need, if it is known and not too far ahead."""
+        if state.clock is None:
+            return state
         nexts = [member.next_ns for member in state.members if member.joined and member.alive]
         time_ns = min([*state.waiting, *nexts], default=NEVER)
-        if time_ns <= state.time_ns or time_ns == NEVER:
+        if not state.time_ns < time_ns <= max(state.time_ns, state.clock.time_ns) + self._window_ns:
             return state
         return state._replace(expected=self._expected(state, time_ns))
 

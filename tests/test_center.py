@@ -250,10 +250,14 @@ def test_what_is_prepared_is_not_done_again() -> None:
     assert stage.tracks.log_lr_total[0] > 900.0
 
 
-def test_nothing_is_prepared_while_nothing_is_due() -> None:
+@pytest.mark.parametrize("next_s", [None, 1e9])
+def test_nothing_is_prepared_while_nothing_is_due_soon(next_s: float | None) -> None:
     stage = Stage(scenario())
     assert stage.center.prepare(stage.state) is stage.state
-    stage.join("a", None)
+    stage.join_all()
+    for name in ("a", "b"):
+        stage.tell(stage.report(name, 2.0)._replace(next_ns=stage.ns(next_s)))
+    assert len(stage.state.history) == 1
     assert stage.center.prepare(stage.state) is stage.state
 
 

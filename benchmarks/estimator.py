@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from common.estimation.association import Clutter, Plots, pdaf, tight
+from common.estimation.association import Clutter, Plots, expect, pdaf, update
 from common.estimation.field_of_view import Everywhere
 from common.estimation.gaussian import Array, Gaussian
 from common.estimation.motion import ConstantVelocity
@@ -78,13 +78,12 @@ def waldnet_scan(tracks: int, *, tightly: bool) -> Callable[[], object]:
 
     def scan() -> object:
         predicted = share.predict(factor, MOTION, dt)
-        sensor = SENSOR.linearise(predicted.x, origin)
         if not tightly:
-            filtered = pdaf(predicted, plots, sensor, clutter)
+            filtered = pdaf(predicted, plots, SENSOR.linearise(predicted.x, origin), clutter)
             return log_p_bar + filtered.log_p_bar
-        association = honest.predict(prior, MOTION, dt)
-        both = (sensor, SENSOR.linearise(association.x, origin))
-        filtered, _ = tight(predicted, association, plots, both, clutter)
+        pairs = zip(predicted, honest.predict(prior, MOTION, dt), strict=True)
+        both = Gaussian(*(np.stack(pair) for pair in pairs))
+        filtered = update(expect(both, SENSOR.linearise(both.x, origin), clutter), plots)
         return log_p_bar + filtered.log_p_bar
 
     return scan

@@ -43,8 +43,9 @@ lock: ## resolve the locks anew from pyproject.toml (needs uv)
 	uv pip compile pyproject.toml requirements/build.in --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --quiet -o requirements/user.lock
 	uv pip compile pyproject.toml requirements/build.in --extra test -c requirements/user.lock --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --quiet -o requirements/test.lock
 
-bench: $(VENV)/test.stamp ## speed of the estimator beside Stone Soup
+bench: $(VENV)/test.stamp ## speed of the estimator beside Stone Soup, and of the steps
 	$(BIN)/python benchmarks/estimator.py
+	$(BIN)/python benchmarks/steps.py
 
 figures: $(VENV)/test.stamp ## measure all figures of docs/performance.md anew (half an hour, needs root)
 	$(BIN)/python -m benchmarks.figures docs/performance.md

@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from common.estimation.association import Clutter, Plots, pdaf, tight
+from common.estimation.association import Clutter, Plots, expect, pdaf, update
 from common.estimation.field_of_view import Everywhere
 from common.estimation.gaussian import Array, Gaussian
 from common.estimation.motion import ConstantVelocity
@@ -33,7 +33,7 @@ from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import thresholds
 from common.messages import NEVER, Report
 from common.quantities import NS_PER_S
-from fusion_center.picture import Fuser
+from fusion_center.picture import Fuser, Heard
 
 BATCHES = (1, 10, 100, 1000)
 PLOTS, SENSORS = 6, 4
@@ -78,13 +78,12 @@ def waldnet_scan(tracks: int, *, tightly: bool) -> Callable[[], object]:
 
     def scan() -> object:
         predicted = share.predict(factor, MOTION, dt)
-        sensor = SENSOR.linearise(predicted.x, origin)
         if not tightly:
-            filtered = pdaf(predicted, plots, sensor, clutter)
+            filtered = pdaf(predicted, plots, SENSOR.linearise(predicted.x, origin), clutter)
             return log_p_bar + filtered.log_p_bar
-        association = honest.predict(prior, MOTION, dt)
-        both = (sensor, SENSOR.linearise(association.x, origin))
-        filtered, _ = tight(predicted, association, plots, both, clutter)
+        pairs = zip(predicted, honest.predict(prior, MOTION, dt), strict=True)
+        both = Gaussian(*(np.stack(pair) for pair in pairs))
+        filtered = update(expect(both, SENSOR.linearise(both.x, origin), clutter), plots)
         return log_p_bar + filtered.log_p_bar
 
     return scan
@@ -99,7 +98,8 @@ def center_scan(tracks: int) -> Callable[[], object]:
     picture = fuser.begin(fuser.empty(), ids, now, prior)
     x, P, log_g = prior.x + 10.0, 0.5 * SENSORS * prior.P, np.ones(tracks)
     later = round(DT * NS_PER_S)
-    reports = {s: Report(str(s), 0, later, NEVER, 1, ids, np.ones_like(ids), log_g, x, P) for s in range(SENSORS)}
+    report = Report("", 0, later, NEVER, 1, ids, np.ones_like(ids), log_g, x, P)
+    reports = {number: Heard.of(report) for number in range(SENSORS)}
     return lambda: fuser.advance(fuser.expect(picture, later), reports)
 
 
@@ -156,9 +156,13 @@ def measure() -> dict[str, Any]:
                 "stone_soup_over_pdaf": round(soup / factor, 1),
             }
         )
+    return {"machine": machine(), "plots": PLOTS, "sensors": SENSORS, "rows": rows}
+
+
+def machine() -> dict[str, Any]:
+    """Processor and versions."""
     versions = {name: version(name) for name in ("numpy", "scipy", "stonesoup")}
-    machine = {"cpu": _cpu(), "cores": os.cpu_count(), "python": platform.python_version(), **versions}
-    return {"machine": machine, "plots": PLOTS, "sensors": SENSORS, "rows": rows}
+    return {"cpu": _cpu(), "cores": os.cpu_count(), "python": platform.python_version(), **versions}
 
 
 def _cpu() -> str:

@@ -20,7 +20,7 @@ from common.estimation.gaussian import Gaussian
 from common.estimation.sprt import DELETED
 from common.messages import NEVER, Advice, Clock, Decision, Join, Message, Report, Start, Stop, Tracks
 from common.quantities import NS_PER_S
-from fusion_center.picture import Expected, Fuser, Picture
+from fusion_center.picture import Expected, Fuser, Heard, Picture
 
 #: Wall time between the clock's announcement and its start: nodes on a slow link hear of it in time.
 _LEAD_NS = 50_000_000
@@ -65,7 +65,7 @@ class Checkpoint(NamedTuple):
     """One measurement time, worked in."""
 
     time_ns: int
-    reports: Mapping[int, Report]
+    reports: Mapping[int, Heard]
     picture: Picture
     decisions: tuple[Decision, ...]
 
@@ -78,7 +78,7 @@ class Waiting(NamedTuple):
         since_ns: wall time of the first one's arrival.
     """
 
-    reports: Mapping[int, Report]
+    reports: Mapping[int, Heard]
     since_ns: int
 
 
@@ -221,8 +221,8 @@ class Center:
             case Presence() if event.sensor in self.names:
                 number = self.names.index(event.sensor)
                 state = _with_member(state, number, state.members[number]._replace(alive=event.alive))
-            case Report() if self._fits(state, event, now_ns):
-                state, messages = self._accept(state, event, now_ns)
+            case Report() if (heard := self._fitting(state, event, now_ns)) is not None:
+                state, messages = self._accept(state, heard, now_ns)
             case Report() | Join():
                 state = _count(state, "refused")
             case _:
@@ -233,10 +233,12 @@ class Center:
         return state, [*messages, *clock, *released, *clear]
 
     def prepare(self, state: State) -> State:
-        """Work out ahead what the next measurement time will need, unless that is done or none is known."""
+        """Work out ahead what the next measurement time will need, if it is known and not too far ahead."""
+        if state.clock is None:
+            return state
         nexts = [member.next_ns for member in state.members if member.joined and member.alive]
         time_ns = min([*state.waiting, *nexts], default=NEVER)
-        if time_ns <= state.time_ns or time_ns == NEVER:
+        if not state.time_ns < time_ns <= max(state.time_ns, state.clock.time_ns) + self._window_ns:
             return state
         return state._replace(expected=self._expected(state, time_ns))
 
@@ -295,16 +297,18 @@ class Center:
             P_a=P_a[live],
         )
 
-    def _fits(self, state: State, report: Report, now_ns: int) -> bool:
-        """Whether a report comes from a sensor of this network and can be computed with."""
+    def _fitting(self, state: State, report: Report, now_ns: int) -> Heard | None:
+        """A report, if it comes from a sensor of this network and can be computed with."""
         if report.sensor not in self.names:
-            return False
+            return None
         member = state.members[self.names.index(report.sensor)]
         if not member.joined or report.epoch != member.epoch or report.next_ns <= report.time_ns:
-            return False
+            return None
         if self._ahead(state.clock, report.time_ns, now_ns):
-            return False
-        return report.x.shape[-1] == self.fuser.motion.n and bool((report.terms == 1).all()) and _sound(report)
+            return None
+        if report.x.shape[-1] != self.fuser.motion.n or (report.terms != 1).any():
+            return None
+        return _sound(report)
 
     def _ahead(self, clock: Clock | None, time_ns: int, now_ns: int) -> bool:
         """Whether a time lies farther in the future than the window: one wrong clock must not make all others late."""
@@ -313,21 +317,23 @@ class Center:
         present_ns = clock.time_ns + round((now_ns - clock.wall_ns) * clock.speed)
         return time_ns > present_ns + self._window_ns + NS_PER_S
 
-    def _accept(self, state: State, report: Report, now_ns: int) -> tuple[State, list[Message]]:
+    def _accept(self, state: State, heard: Heard, now_ns: int) -> tuple[State, list[Message]]:
+        report = heard.report
         number = self.names.index(report.sensor)
         member = state.members[number]
         # It does not show that its sensor is there: the end of a token may overtake the last reports.
         state = _with_member(state, number, member._replace(next_ns=max(member.next_ns, report.next_ns)))
         if report.time_ns <= state.time_ns:
-            return self._late(state, number, report)
+            return self._late(state, number, heard)
         waiting = state.waiting.get(report.time_ns, Waiting({}, now_ns))
         if number in waiting.reports:
             return _count(state, "repeated"), []
-        waiting = waiting._replace(reports={**waiting.reports, number: report})
+        waiting = waiting._replace(reports={**waiting.reports, number: heard})
         return state._replace(waiting={**state.waiting, report.time_ns: waiting}), []
 
-    def _late(self, state: State, number: int, report: Report) -> tuple[State, list[Message]]:
+    def _late(self, state: State, number: int, heard: Heard) -> tuple[State, list[Message]]:
         """Give a late report its place and compute anew from there on."""
+        report = heard.report
         if report.time_ns <= state.base_ns:
             return _count(state, "too_late"), []
         at = bisect_left(state.history, report.time_ns, key=lambda checkpoint: checkpoint.time_ns)
@@ -335,7 +341,7 @@ class Center:
         group = groups.get(report.time_ns, {})
         if number in group:
             return _count(state, "repeated"), []
-        groups[report.time_ns] = {**group, number: report}
+        groups[report.time_ns] = {**group, number: heard}
         before = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
         state = _count(state._replace(history=state.history[:at]), "late")
         pictures: list[Message] = []
@@ -345,7 +351,7 @@ class Center:
         after = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
         return state, [*_corrections(before, after), *pictures]
 
-    def _work_in(self, state: State, time_ns: int, reports: Mapping[int, Report]) -> State:
+    def _work_in(self, state: State, time_ns: int, reports: Mapping[int, Heard]) -> State:
         picture, decisions = self.fuser.advance(self._expected(state, time_ns), reports)
         return state._replace(history=(*state.history, Checkpoint(time_ns, reports, picture, tuple(decisions))))
 
@@ -447,16 +453,15 @@ class Center:
         )
 
 
-def _sound(report: Report) -> bool:
-    """Whether factors can be computed with: positive definite, and far from where squares overflow."""
-    variances = np.diagonal(report.P, axis1=-2, axis2=-1)
+def _sound(report: Report) -> Heard | None:
+    """A report, if its factors can be computed with: positive definite, and far from where squares overflow."""
+    variances = report.P.diagonal(axis1=-2, axis2=-1)
     if (np.abs(report.x) > _LARGEST).any() or (variances > _LARGEST**2).any() or (variances < _LARGEST**-2).any():
-        return False
+        return None
     try:
-        np.linalg.cholesky(report.P)
+        return Heard.of(report)
     except np.linalg.LinAlgError:
-        return False
-    return True
+        return None
 
 
 def _with_member(state: State, number: int, member: Member) -> State:

@@ -10,7 +10,7 @@ import numpy as np
 
 from common.config import Scenario
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, product
+from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, multiply, whitener
 from common.estimation.motion import Motion
 from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
@@ -59,6 +59,27 @@ class Picture(NamedTuple):
     network_P: Array
 
 
+class Heard(NamedTuple):
+    """A report, its factors taken apart when it came.
+
+    Attributes:
+        report: as it came.
+        factors: of the report.
+    """
+
+    report: Report
+    factors: Whitened
+
+    @classmethod
+    def of(cls, report: Report) -> Heard:
+        """Take a report apart.
+
+        Raises:
+            numpy.linalg.LinAlgError: when a covariance is not positive definite.
+        """
+        return cls(report, Whitened(report.x, *whitener(report.P)))
+
+
 class Expected(NamedTuple):
     """A picture at its next measurement time: all that does not depend on what will be reported.
 
@@ -69,6 +90,7 @@ class Expected(NamedTuple):
         live: which of them started before.
         moving: those.
         factors: those, predicted.
+        whitened: the same, taken apart.
         product: of the predicted factors.
         network_P: for ``dkf``, the covariances that all factors have by the models alone, predicted.
     """
@@ -79,6 +101,7 @@ class Expected(NamedTuple):
     live: BoolArray
     moving: Picture
     factors: Gaussian
+    whitened: Whitened
     product: Product
     network_P: Array
 
@@ -89,13 +112,14 @@ class Reported(NamedTuple):
     Attributes:
         who: which sensors reported which track, shape (T, S).
         log_p_bar: cumulative, shape (T, S); where nothing was reported, the last one.
-        x, P: factors, shapes (T, S, n), (T, S, n, n); where nothing was reported, the predicted ones.
+        P: of the factors, shape (T, S, n, n); where nothing was reported, of the predicted ones.
+        factors: the same, taken apart.
     """
 
     who: BoolArray
     log_p_bar: Array
-    x: Array
     P: Array
+    factors: Whitened
 
 
 @dataclass(frozen=True)
@@ -186,9 +210,10 @@ class Fuser:
         live = kept.times_ns < t_ns
         moving = take(kept, live)
         factors, network_P = self._predict(moving, t_ns)
-        return Expected(picture, t_ns, kept, live, moving, factors, product(factors), network_P)
+        whitened = Whitened(factors.x, *whitener(factors.P))
+        return Expected(picture, t_ns, kept, live, moving, factors, whitened, multiply(whitened), network_P)
 
-    def advance(self, expected: Expected, reports: Mapping[int, Report]) -> tuple[Picture, list[Decision]]:
+    def advance(self, expected: Expected, reports: Mapping[int, Heard]) -> tuple[Picture, list[Decision]]:
         """Work in all reports of one measurement time.
 
         A sensor that is silent, or does not report a track, keeps its factor there, predicted, with p_bar = 1.
@@ -204,14 +229,14 @@ class Fuser:
         moved, decisions = self._decide(moved)
         return (moved if expected.live.all() else put(expected.kept, expected.live, moved)), decisions
 
-    def _move(self, expected: Expected, reports: Mapping[int, Report]) -> Picture:
+    def _move(self, expected: Expected, reports: Mapping[int, Heard]) -> Picture:
         picture, before = expected.moving, expected.product
-        said = _collect(picture, expected.factors, reports)
+        said = _collect(expected, reports)
         heard = said.who.any(axis=-1)
-        after = product(Gaussian(said.x, said.P)) if heard.any() else before
+        after = multiply(said.factors) if heard.any() else before
         # Cumulative sums that are both -inf have not changed.
-        changed = said.log_p_bar != picture.log_p_bar
-        evidence = np.subtract(said.log_p_bar, picture.log_p_bar, out=np.zeros_like(said.log_p_bar), where=changed)
+        same = said.log_p_bar == picture.log_p_bar
+        evidence = np.where(same, 0.0, said.log_p_bar) - np.where(same, 0.0, picture.log_p_bar)
         # A track that nobody reported stays as it is, to the last digit.
         step = np.where(heard, log_lambda(before, after, evidence), 0.0)
         network_P = self._shrunk(expected.network_P, reports) if self.globalised else expected.network_P
@@ -223,7 +248,7 @@ class Fuser:
             log_p_bar=said.log_p_bar,
             reported=picture.reported | said.who,
             contributing=said.who,
-            x=said.x,
+            x=said.factors.x,
             P=said.P,
             fused_x=after.density.x,
             fused_P=after.density.P,
@@ -242,7 +267,7 @@ class Fuser:
         predicted = self.share.predict(Gaussian(np.matvec(common.G, factors.x), P), self.motion, dt)
         return predicted, predicted.P
 
-    def _shrunk(self, network_P: Array, reports: Mapping[int, Report]) -> Array:
+    def _shrunk(self, network_P: Array, reports: Mapping[int, Heard]) -> Array:
         network_P = network_P.copy()
         for number in reports:
             linear = self.sensors[number].measurement.linearise(
@@ -255,8 +280,6 @@ class Fuser:
         if self.limits is None:
             return picture, []
         verdict = decide(picture.log_lr, picture.status, self.limits)
-        if not (verdict.accepted | verdict.rejected).any():
-            return picture, []
         # Confirmed anew, a track only has its LR reset: that is monitoring, not a decision.
         decisions = [
             Decision(
@@ -267,21 +290,24 @@ class Fuser:
                 log_lr_total=float(picture.log_lr_total[row]),
                 scans=int(picture.scans[row]),
             )
-            for row in np.flatnonzero(verdict.status != picture.status)
+            for row in np.nonzero(verdict.status != picture.status)[0]
         ]
         return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
 
 
-def _collect(picture: Picture, predicted: Gaussian, reports: Mapping[int, Report]) -> Reported:
+def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
     """Lay the reports over the predicted factors; tracks that a report or the picture lacks are left alone."""
-    said = Reported(np.zeros_like(picture.reported), picture.log_p_bar.copy(), predicted.x.copy(), predicted.P.copy())
-    for number, report in reports.items():
-        rows, theirs = _common(picture.ids, report.ids)
-        said.who[rows, number] = True
-        said.log_p_bar[rows, number] = report.log_g[theirs]
-        said.x[rows, number] = report.x[theirs]
-        said.P[rows, number] = report.P[theirs]
-    return said
+    picture = expected.moving
+    who, log_p_bar = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy()
+    P, factors = expected.factors.P.copy(), Whitened(*(array.copy() for array in expected.whitened))
+    for number, (report, theirs) in reports.items():
+        rows, others = _common(picture.ids, report.ids)
+        who[rows, number] = True
+        log_p_bar[rows, number] = report.log_g[others]
+        P[rows, number] = report.P[others]
+        for array, new in zip(factors, theirs, strict=True):
+            array[rows, number] = new[others]
+    return Reported(who, log_p_bar, P, factors)
 
 
 def _common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:

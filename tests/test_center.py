@@ -220,6 +220,47 @@ def test_the_worst_order_does_not_matter() -> None:
     assert "withdrawn" in {decision.kind for decision in stage.decisions}
 
 
+@pytest.mark.parametrize("pace_s", [0.01, 1.0], ids=["within the hold-back", "beyond the hold-back"])
+@pytest.mark.parametrize("seed", [None, 0, 1])
+def test_work_done_ahead_changes_no_digit(seed: int | None, pace_s: float) -> None:
+    count = len(ORDERED_REPORTS)
+    order = range(count) if seed is None else np.random.default_rng(seed).permutation(count)
+    (eager, _), (lazy, _) = ordered_stage(), ordered_stage()
+    for at, number in enumerate(order, start=1):
+        eager.state = eager.center.prepare(eager.state)
+        for stage in (eager, lazy):
+            stage.tell(ORDERED_REPORTS[number], at * pace_s)
+    for stage in (eager, lazy):
+        stage.tick(1e6)
+    assert all_same(eager.said, lazy.said)
+    assert eager.state.history[-1].picture.scans.tolist() == lazy.state.history[-1].picture.scans.tolist()
+
+
+def test_what_is_prepared_is_not_done_again() -> None:
+    stage = pair()
+    stage.state = ahead = stage.center.prepare(stage.state)
+    assert ahead.expected is not None
+    assert ahead.expected.t_ns == stage.ns(2.0)
+    assert stage.center.prepare(ahead).expected is ahead.expected
+    # Were it computed anew, nobody would notice the spoilt constant.
+    spoilt = ahead.expected.product._replace(log_c=ahead.expected.product.log_c - 1000.0)
+    stage.state = ahead._replace(expected=ahead.expected._replace(product=spoilt))
+    stage.tell(stage.report("a", 2.0))
+    stage.tell(stage.report("b", 2.0))
+    assert stage.tracks.log_lr_total[0] > 900.0
+
+
+@pytest.mark.parametrize("next_s", [None, 1e9])
+def test_nothing_is_prepared_while_nothing_is_due_soon(next_s: float | None) -> None:
+    stage = Stage(scenario())
+    assert stage.center.prepare(stage.state) is stage.state
+    stage.join_all()
+    for name in ("a", "b"):
+        stage.tell(stage.report(name, 2.0)._replace(next_ns=stage.ns(next_s)))
+    assert len(stage.state.history) == 1
+    assert stage.center.prepare(stage.state) is stage.state
+
+
 @settings(deadline=None, derandomize=True, database=None, max_examples=25)
 @given(
     st.lists(st.integers(0, len(ORDERED_REPORTS) - 1), min_size=1, max_size=14),

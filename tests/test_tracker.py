@@ -180,6 +180,73 @@ def test_a_step_leaves_the_state_before_as_it_was() -> None:
     assert same(tracker.scan(state, scan, NEVER)[1], first[1])
 
 
+# Work done ahead ------------------------------------------------------------------------------------------------------
+
+
+def prepared(keeper: Node, scan: Scan) -> Any:
+    """What a node has ready for a scan."""
+    keeper.state = keeper.tracker.prepare(keeper.state, scan.time_ns, scan.position)
+    return keeper.state.ready
+
+
+@each_configuration
+def test_work_done_ahead_changes_no_digit(mode: str, association: str) -> None:
+    plot = world(mode, association)
+    tracks = start(plot, 0.0, 3.0, 4.0)
+    eager, lazy = node(plot, tracks), node(plot, tracks)
+    for scan in simulate(plot, "a", 1):
+        prepared(eager, scan)
+        assert same(eager.scan(scan), lazy.scan(scan))
+        assert same(eager.state.tracks, lazy.state.tracks)
+
+
+def test_what_is_prepared_is_not_done_again() -> None:
+    plot = world()
+    keeper, scan = node(plot, start(plot, 0.0)), scan_at(plot, 2.0, (300.0, 0.0))
+    ready = prepared(keeper, scan)
+    assert prepared(keeper, scan) is ready
+    # Were it computed anew, nobody would notice the spoilt prediction.
+    spoilt = ready._replace(expected=ready.expected._replace(z=ready.expected.z + 1000.0))
+    keeper.state = keeper.state._replace(ready=spoilt)
+    assert keeper.scan(scan).log_g[0] < node(plot, start(plot, 0.0)).scan(scan).log_g[0] - 1.0
+
+
+@pytest.mark.parametrize(("time_s", "position"), [(2.5, (3000.0, 0.0)), (2.0, (3000.0, 1.0))])
+def test_what_was_prepared_for_another_scan_is_not_used(time_s: float, position: tuple[float, float]) -> None:
+    plot = world()
+    tracks, scan = start(plot, 0.0, 0.0), scan_at(plot, 2.0, (300.0, 0.0))
+    keeper = node(plot, tracks)
+    prepared(keeper, scan_at(plot, time_s, position=position))
+    assert same(keeper.scan(scan), node(plot, tracks).scan(scan))
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_what_comes_in_between_is_not_missed(again: bool) -> None:
+    """Start, stop and advice, also from ahead, out of order and repeated, between the preparation and the scan."""
+    plot = world(fusion={"feedback": "advice"})
+    tracks = start(plot, 0.0, 0.0, 0.0)
+    eager, lazy = node(plot, rows(tracks, 0, 1)), node(plot, rows(tracks, 0, 1))
+    commands = {
+        2: [("start", rows(tracks, 2))],
+        3: [("advise", advice_at(plot, 6.0, 0, 1, 2))],
+        4: [("advise", advice_at(plot, 8.0, 2)), ("advise", advice_at(plot, 7.0, 0, 1))],
+        5: [("advise", advice_at(plot, 99.0, 0))],
+        6: [("stop", Stop("a", np.array([1]))), ("advise", advice_at(plot, 11.0, 0, 1))],
+        7: [("start", start(plot, 3.0, 4.0, epoch=9))],
+        8: [("stop", Stop("a", np.array([77]))), ("start", start(plot, 3.0, 4.0, epoch=9))],
+    }
+    for number, scan in enumerate(simulate(plot, "a", 1)):
+        prepared(eager, scan)
+        for name, message in commands.get(number, []):
+            for keeper in (eager, lazy):
+                keeper.state = getattr(keeper.tracker, name)(keeper.state, message)
+            if again:
+                prepared(eager, scan)
+        assert same(eager.scan(scan), lazy.scan(scan))
+        assert same(eager.state.tracks, lazy.state.tracks)
+        assert len(eager.state.advice) == len(lazy.state.advice)
+
+
 # Start and stop -------------------------------------------------------------------------------------------------------
 
 

@@ -254,31 +254,6 @@ def pdaf(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter
     return Filtered(Gaussian(density.x[0], density.P[0]), log_p_bar)
 
 
-def tight(
-    factor: Gaussian, association: Gaussian, plots: Plots, sensors: tuple[Linearised, Linearised], clutter: Clutter
-) -> tuple[Filtered, Gaussian]:
-    """One scan with tight association (Eq. 12, 13): the association filter alone decides who is who.
-
-    Args:
-        factor: predicted factors, shapes (..., n), (..., n, n).
-        association: predicted association filters, same shapes.
-        plots: of the scan.
-        sensors: linearised at ``factor.x`` and at ``association.x``.
-        clutter: detection probability, false plots, gate (of the association filter).
-
-    Returns:
-        the factor with its log p_bar (Eq. 13), and the association filter.
-    """
-    both = Gaussian(np.stack([factor.x, association.x]), np.stack([factor.P, association.P]))
-    batch = factor.x.shape[:-1]
-    z, H, R = (
-        np.stack([np.broadcast_to(a, (*batch, *a.shape[-d:])) for a in pair])
-        for pair, d in zip(zip(*sensors, strict=True), (1, 2, 2), strict=True)
-    )
-    density, log_p_bar = update(expect(both, Linearised(z, H, R), clutter), plots)
-    return Filtered(Gaussian(density.x[0], density.P[0]), log_p_bar), Gaussian(density.x[1], density.P[1])
-
-
 def _log(value: Array) -> Array:
     """Logarithm with log 0 = -inf and no warning."""
     return np.log(value, out=np.full_like(value, -np.inf), where=value > 0.0)

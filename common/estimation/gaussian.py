@@ -26,6 +26,20 @@ class Gaussian(NamedTuple):
     P: Array
 
 
+class Whitened(NamedTuple):
+    """Gaussian densities, taken apart: with ``P = L L'``, ``L^-1 (z - x)`` is white.
+
+    Attributes:
+        x: means, shape (..., n).
+        W: L^-1, shape (..., n, n).
+        half_log_det: 0.5 log det P, shape (...).
+    """
+
+    x: Array
+    W: Array
+    half_log_det: Array
+
+
 class Product(NamedTuple):
     """A product of Gaussian densities: ``c N(x; mean, covariance)``.
 
@@ -135,11 +149,12 @@ def whitener(P: Array) -> tuple[Array, Array]:
     n = P.shape[-1]
     A = np.empty((n, 2 * n, P.size // (n * n)))
     A[:, :n], A[:, n:] = P.reshape(-1, n, n).T, identity(n)[..., None]
-    for k in range(n - 1):
-        # Columns before these are done, and those after them still zero.
-        active = slice(k + 1, n + k + 1)
-        rest = A[k + 1 :, active]
-        rest -= A[k + 1 :, k, None] * (A[k, active] / A[k, k])
+    with np.errstate(all="ignore"):  # what is not positive definite is found below
+        for k in range(n - 1):
+            # Columns before these are done, and those after them still zero.
+            active = slice(k + 1, n + k + 1)
+            rest = A[k + 1 :, active]
+            rest -= A[k + 1 :, k, None] * (A[k, active] / A[k, k])
     pivots = A.diagonal()
     if not pivots.min(initial=1.0) > 0.0:
         raise np.linalg.LinAlgError("a matrix is not positive definite")
@@ -202,9 +217,14 @@ def product(factors: Gaussian, members: BoolArray | None = None) -> Product:
     References:
         theory.md Eq. (8), (9); N. Carlson, Federated square root filter (1990).
     """
-    *batch, n_sensors, n = factors.x.shape
-    W, half = whitener(factors.P)
-    half += 0.5 * LOG_2PI * n
+    return multiply(Whitened(factors.x, *whitener(factors.P)), members)
+
+
+def multiply(factors: Whitened, members: BoolArray | None = None) -> Product:
+    """``product`` of factors that are whitened already."""
+    x, W, half = factors
+    *batch, n_sensors, n = x.shape
+    half = half + 0.5 * LOG_2PI * n
     if members is not None:
         W, half = W * members[..., None, None], half * members
     # P^-1 = W'W: with the rows of all sensors one below the other, the sum over them is one product.
@@ -212,8 +232,8 @@ def product(factors: Gaussian, members: BoolArray | None = None) -> Product:
     V, half_information = whitener(gram(rows))
     P = gram(V)
     # Relative to the first factor, so that large coordinates cost no digits.
-    reference = factors.x[..., :1, :]
-    u = np.matvec(W, factors.x - reference).reshape(*batch, n_sensors * n)
+    reference = x[..., :1, :]
+    u = np.matvec(W, x - reference).reshape(*batch, n_sensors * n)
     shift = np.matvec(P, np.vecmat(u, rows))
     w = np.matvec(rows, shift) - u
     log_c = -0.5 * np.vecdot(w, w) - half.sum(axis=-1) - half_information + 0.5 * LOG_2PI * n

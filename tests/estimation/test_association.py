@@ -25,7 +25,7 @@ from stonesoup.types.state import GaussianState
 from stonesoup.types.track import Track
 from stonesoup.updater.probability import PDAUpdater
 
-from common.estimation.association import Clutter, Filtered, Plots, absorb, expect, gate_threshold, pdaf, tight
+from common.estimation.association import Clutter, Filtered, Plots, absorb, expect, gate_threshold, pdaf, update
 from common.estimation.gaussian import Array, Gaussian
 from common.estimation.motion import ConstantVelocity, predict
 from common.estimation.representation import Share
@@ -54,6 +54,17 @@ def seen_by(density: Gaussian, sensor: Position = SENSOR) -> Linearised:
 
 def clutter(p_d: float | Array, rho_f: float = 1e-3, p_g: float = 1.0) -> Clutter:
     return Clutter(np.asarray(p_d, dtype=np.float64), np.array(np.log(rho_f)), p_g)
+
+
+def tight(
+    factor: Gaussian, association: Gaussian, plots: Plots, sensors: tuple[Linearised, Linearised], clutter: Clutter
+) -> tuple[Filtered, Gaussian]:
+    """The factor with its log p_bar (Eq. 13), and the association filter."""
+    both = Gaussian(np.stack([factor.x, association.x]), np.stack([factor.P, association.P]))
+    H = np.stack([np.broadcast_to(sensor.H, (*factor.x.shape[:-1], *sensor.H.shape[-2:])) for sensor in sensors])
+    linear = Linearised(np.stack([sensor.z for sensor in sensors]), H, sensors[0].R)
+    (x, P), log_p_bar = update(expect(both, linear, clutter), plots)
+    return Filtered(Gaussian(x[0], P[0]), log_p_bar), Gaussian(x[1], P[1])
 
 
 def plots(z: Array, valid: Array | None = None) -> Plots:

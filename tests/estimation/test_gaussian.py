@@ -20,12 +20,14 @@ from common.estimation.gaussian import (
     Array,
     Gaussian,
     half_log_det,
+    joseph,
     log_pdf,
     log_sum_exp,
     moments,
     product,
     symmetric,
     whiten,
+    whitener,
 )
 
 Draw: TypeAlias = Callable[..., Gaussian]
@@ -235,6 +237,65 @@ def test_whiten_and_half_log_det_equal_scipy(n: int, shape: tuple[int, ...], dra
     for row in np.ndindex(shape):
         np.testing.assert_allclose(w[row], solve_triangular(L[row], d[row], lower=True), rtol=1e-11, atol=1e-12)
         assert half[row] == pytest.approx(0.5 * np.linalg.slogdet(P[row])[1], rel=1e-11, abs=1e-12)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_whitener_is_the_inverse_of_the_cholesky_factor(n: int, shape: tuple[int, ...], draw: Draw) -> None:
+    P = draw(np.random.default_rng([n, len(shape)]), shape, n).P
+    W, half = whitener(P)
+    assert W.shape == (*shape, n, n)
+    assert half.shape == shape
+    for row in np.ndindex(shape):
+        expected = solve_triangular(np.linalg.cholesky(P[row]), np.eye(n), lower=True)
+        np.testing.assert_allclose(W[row], expected, rtol=1e-11, atol=1e-12)
+        assert half[row] == pytest.approx(0.5 * np.linalg.slogdet(P[row])[1], rel=1e-11, abs=1e-12)
+
+
+def test_whitener_does_not_depend_on_the_rest_of_the_batch(draw: Draw) -> None:
+    P = draw(np.random.default_rng(12), (5, 2), 4, 100.0).P
+    W, half = whitener(P)
+    for row in np.ndindex(5, 2):
+        one, one_half = whitener(P[row])
+        np.testing.assert_array_equal(W[row], one)
+        np.testing.assert_allclose(half[row], one_half, rtol=1e-15)
+
+
+NOT_POSITIVE = [
+    np.zeros((3, 3)),
+    np.ones((3, 3)),
+    np.diag([1.0, -1.0, 1.0]),
+    np.diag([1.0, 1.0, 0.0]),
+    np.array([[1.0, 1e300, 0.0], [1e300, 1.0, 1e300], [0.0, 1e300, 1.0]]),
+    np.full((3, 3), np.nan),
+]
+
+
+@pytest.mark.parametrize("P", NOT_POSITIVE)
+def test_one_matrix_that_is_not_positive_definite_is_an_error_and_no_warning(P: Array) -> None:
+    for batch in (P, np.stack([np.eye(3), P])):
+        with pytest.raises(np.linalg.LinAlgError):
+            whitener(batch)
+
+
+def test_whitener_of_nothing_is_nothing() -> None:
+    W, half = whitener(np.empty((0, 4, 4)))
+    assert (W.shape, half.shape) == ((0, 4, 4), (0,))
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_joseph_is_the_covariance_of_any_gain(scale: float, draw: Draw) -> None:
+    """Of an estimate x + K (z - H x): the error is (I - K H) e_x + K e_z."""
+    rng = np.random.default_rng(13)
+    P, R = draw(rng, (3,), 4, scale).P, draw(rng, (3,), 2).P
+    K, H = rng.normal(size=(3, 4, 2)), rng.normal(size=(3, 2, 4))
+    ours, shared = joseph(P, K, H, R), joseph(P, K, H[0], R[0])
+    for row in range(3):
+        for result, h, r in ((ours, H[row], R[row]), (shared, H[0], R[0])):
+            A = np.eye(4) - K[row] @ h
+            expected = A @ P[row] @ A.T + K[row] @ r @ K[row].T
+            np.testing.assert_allclose(result[row], expected, rtol=1e-10, atol=1e-10 * np.abs(expected).max())
+    np.testing.assert_array_equal(ours, ours.mT)
 
 
 def test_whiten_broadcasts_both_ways(draw: Draw) -> None:

@@ -265,7 +265,7 @@ def cut_and_heal(folder: Path, router: bool) -> None:
     """Longer than any lease; the window of late reports is longer still."""
     folder.mkdir()
     window = ('association = "tight"', 'association = "tight"\nwindow = 100.0')
-    path = only_sensors(variant(folder, "cut", *STEADY, window, ("duration = 60.0", "duration = 48.0")), 2)
+    path = only_sensors(variant(folder, "cut", *STEADY, window, ("duration = 60.0", "duration = 40.0")), 2)
     with hosts(path, SLOW) as net, Processes(folder) as processes:
         linked = Linked(net, processes, path, router=router)
         listener = linked.listen()
@@ -276,6 +276,7 @@ def cut_and_heal(folder: Path, router: bool) -> None:
         net.cut("radar-2")
         center.await_log("sensor lost")
         node.await_log("the center is gone")
+        listener.await_line("center/tracks", 8)  # ten seconds later
         net.heal("radar-2")
         linked.wait()
         heard = heard_by(listener)

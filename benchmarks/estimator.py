@@ -13,17 +13,15 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import os
-import platform
 import statistics
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks.machine import machine
 from common.estimation.association import Clutter, Plots, expect, pdaf, update
 from common.estimation.field_of_view import Everywhere
 from common.estimation.gaussian import Array, Gaussian
@@ -35,6 +33,7 @@ from common.messages import NEVER, Report
 from common.quantities import NS_PER_S
 from fusion_center.picture import Fuser, Heard
 
+PACKAGES = ("numpy", "scipy", "stonesoup")
 BATCHES = (1, 10, 100, 1000)
 PLOTS, SENSORS = 6, 4
 P_D, RHO_F, P_G = 0.9, 5.0 / 40_000.0**2, 0.9997
@@ -156,18 +155,7 @@ def measure() -> dict[str, Any]:
                 "stone_soup_over_pdaf": round(soup / factor, 1),
             }
         )
-    return {"machine": machine(), "plots": PLOTS, "sensors": SENSORS, "rows": rows}
-
-
-def machine() -> dict[str, Any]:
-    """Processor and versions."""
-    versions = {name: version(name) for name in ("numpy", "scipy", "stonesoup")}
-    return {"cpu": _cpu(), "cores": os.cpu_count(), "python": platform.python_version(), **versions}
-
-
-def _cpu() -> str:
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+    return {"machine": machine(*PACKAGES), "plots": PLOTS, "sensors": SENSORS, "rows": rows}
 
 
 def main() -> None:

@@ -19,8 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from estimator import machine
 
+from benchmarks.machine import machine
 from common.config import DecisionConfig, Scenario, load_scenario
 from common.messages import Join, Scan, Start
 from fusion_center.center import Center
@@ -90,7 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     arguments = parser.parse_args()
-    about, rows = machine(), [{"tracks": tracks, **microseconds(steps(tracks))} for tracks in TRACKS]
+    about, rows = machine("numpy"), [{"tracks": tracks, **microseconds(steps(tracks))} for tracks in TRACKS]
     if arguments.json:
         arguments.json.write_text(json.dumps({"machine": about, "rows": rows}, indent=2) + "\n")
     print(", ".join(f"{key} {value}" for key, value in about.items()))

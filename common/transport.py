@@ -207,10 +207,9 @@ def _link_settings(bit_s: float | None) -> dict[str, Any]:
     if bit_s is None:
         return {"tx": {"lease": _LEASE_MS}}
     second = min(max(round(bit_s / 8.0), 4096), 1 << 20)
-    return {
-        "tx": {"lease": _LEASE_MS, "batch_size": min(second // 4, 49152), "queue": {"size": _QUEUE}},
-        "tcp": {"so_rcvbuf": second, "so_sndbuf": second // 2},
-    }
+    buffers = {"so_rcvbuf": second, "so_sndbuf": second // 2}
+    batches = {"batch_size": min(second // 4, 49152), "queue": {"size": _QUEUE}}
+    return {"tx": {"lease": _LEASE_MS, **batches}, "tcp": buffers, "tls": buffers}
 
 
 def _listening(session: zenoh.Session, network: Network) -> tuple[str, ...]:

@@ -170,7 +170,8 @@ class NodeShell:
             self._join()
 
     def _join(self) -> None:
-        if self._clock is None:
+        # The first time counts: over a slow link a node asks again before it can have been answered.
+        if self._clock is None and not self._joined_ns:
             self._joined_ns = time.time_ns()
         self._publish(Join(self._name, self._incarnation, self._next_ns(), self._tracker.digest))
 

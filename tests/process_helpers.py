@@ -29,6 +29,7 @@ from studies.record import Record
 
 #: Nothing takes so long; whoever waits longer waits in vain.
 PATIENCE_S = 60.0
+WALDNET = str(Path(sys.executable).with_name("waldnet"))
 ANY_PORT = "tcp/127.0.0.1:0"
 _MARK = "WALDNET_TEST_FAMILY"
 
@@ -71,9 +72,9 @@ class Process:
         """Process id."""
         return self._child.pid
 
-    def await_line(self, text: str) -> str:
-        """The first line of standard output that contains ``text``, as soon as it is there."""
-        return self._await("out", text)
+    def await_line(self, text: str, number: int = 1) -> str:
+        """The first line of standard output that contains ``text``, or a later one, as soon as it is there."""
+        return self._await("out", text, number)
 
     def await_log(self, text: str) -> str:
         """The first line of standard error that contains ``text``, as soon as it is there."""
@@ -109,9 +110,9 @@ class Process:
             self._open.discard(name)
             self._news.notify_all()
 
-    def _await(self, name: str, text: str) -> str:
+    def _await(self, name: str, text: str, number: int = 1) -> str:
         def found() -> str | None:
-            return next((line for line in self._lines[name] if text in line), None)
+            return next(iter([line for line in self._lines[name] if text in line][number - 1 :]), None)
 
         with self._news:
             self._news.wait_for(lambda: found() is not None or name not in self._open, PATIENCE_S)
@@ -130,7 +131,7 @@ class Processes:
 
     def waldnet(self, *arguments: object) -> Process:
         """Start ``waldnet`` with arguments."""
-        return self.start(str(Path(sys.executable).with_name("waldnet")), *map(str, arguments))
+        return self.start(WALDNET, *map(str, arguments))
 
     def start(self, *command: str) -> Process:
         """Start a command."""

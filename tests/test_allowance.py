@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -22,7 +23,7 @@ def test_display_takes_no_more_than_the_rate_leaves_and_what_is_due_always_goes(
             allowance.spend(size)
         elif allowance.grants(size):
             shown, largest = shown + size, max(largest, size)
-    assert shown <= 8000.0 * (now + 1.0) + largest
+    assert shown <= 5600.1 * (now + 2.0) + largest
 
 
 def test_reports_come_before_display() -> None:
@@ -38,10 +39,20 @@ def test_what_is_larger_than_a_second_of_the_link_goes_when_it_is_idle() -> None
     now = 0.0
     allowance = Allowance(64e3, lambda: now)
     assert allowance.grants(16_000)
-    now = 2.0
+    now = 1.0
     assert not allowance.grants(16_000)
-    now = 4.0
+    now = 2.0
     assert allowance.grants(16_000)
+
+
+def test_regular_reports_do_not_starve_display() -> None:
+    now, shown = 0.0, 0
+    allowance = Allowance(64e3, lambda: now)
+    for step in range(100):
+        now = 0.5 * step
+        allowance.spend(750)
+        shown += 16_000 * allowance.grants(16_000)
+    assert shown == pytest.approx(50 * (5600 - 1500), rel=0.15)
 
 
 def test_without_a_rate_everything_is_granted() -> None:

@@ -18,10 +18,12 @@ from common.codec import encode
 from common.config import load_scenario
 from common.errors import ConfigError, WaldnetError
 from common.estimation.sprt import Status
+from common.inbox import Missed
 from common.memory import MemoryNetwork
 from common.messages import Decision, Keys, Scan, Start, Tracks
 from fusion_center.center import Center
 from fusion_center.shell import CenterShell
+from launch.run import Order, Run
 from launch.status import LiveStatus
 from sensor_node.shell import NodeShell
 from sensor_node.tracker import LocalTracker
@@ -91,6 +93,15 @@ def test_a_report_of_a_decision_whose_picture_was_never_heard(tmp_path: Path) ->
     record = Record(scenario())
     record.note(Decision("confirmed", 0, record.scenario.to_ns(2.0), log_lr=10.0, log_lr_total=10.0, scans=1))
     assert all(file.exists() for file in write_report(record, tmp_path, {}))
+
+
+def test_plots_that_were_shed_are_told_once_and_counted(tmp_path: Path) -> None:
+    plot, said = scenario(), io.StringIO()
+    run = Run(Order(plot, tmp_path, None, 1, 0.0, tmp_path, 0), Console(file=said, width=200))
+    for number in (2, 3):
+        run._work_off(Missed(Keys(plot.network.name).plots("a"), number))
+    assert run.record.summary({})["plots_shed"] == {"a": 5}
+    assert said.getvalue().splitlines() == ["a: not all plots are shown, its link is full: reports go first"]
 
 
 def test_whoever_joins_a_lockstep_late_does_not_stop_it() -> None:

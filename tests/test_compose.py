@@ -25,9 +25,11 @@ pytestmark = [pytest.mark.docker, pytest.mark.timeout(540)]
 
 ROOT = Path(__file__).parent.parent
 SENSORS = ("radar-1", "radar-2", "radar-3", "radar-4")
-#: The target stays in sight for as long as the tests take; a loaded machine must not make a sensor overdue.
+#: The target stays in sight for as long as the tests take, and is not deleted because three radars miss it at once; a
+#: loaded machine does not make a sensor overdue.
 CHANGES = (
     ("duration = 60.0", "duration = 1200.0"),
+    ("p_d = 0.9\n", "p_d = 0.99\n"),
     ("psd = 10.0", "psd = 0.1"),
     ("state = [0.0, 0.0, 150.0, 0.0]", "state = [0.0, 0.0, 0.0, 0.0]"),
     ('association = "tight"', 'association = "tight"\nhold_back = 1000.0'),
@@ -80,7 +82,7 @@ class Containers(NamedTuple):
         expected = [name not in missing for name in SENSORS]
 
         def wanted(tracks: Tracks) -> bool:
-            return tracks.ids[0] == 0 and tracks.contributing[0].tolist() == expected
+            return tracks.ids.tolist() == [0] and tracks.contributing[0].tolist() == expected
 
         pictures = [self.observer.await_tracks(wanted) for _ in range(times)]
         assert {picture.status[0] for picture in pictures} == {Status.CONFIRMED}
@@ -103,6 +105,7 @@ def containers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Containers]
         "WALDNET_SCENARIOS": str(folder),
         "WALDNET_SCENARIO": path.name,
         "WALDNET_SPEED": "4",
+        "WALDNET_WAIT": "60",
     }
     with ExitStack() as stack:
         containers = Containers(command, project, env, path, stack.enter_context(Processes(folder)), [])
@@ -131,7 +134,7 @@ def test_decides_as_a_replay_does(containers: Containers) -> None:
     got = {key: point for key, point in points_of(record).items() if key[0] <= record.scenario.to_seconds(last_ns)}
     replayed = points(containers.processes.output("replay", containers.path, "--json"))
     assert_agree(got, {key: point for key, point in replayed.items() if key in got})
-    assert [got[2.0 * 10, track].status for track in range(5)] == ["confirmed", *4 * ["deleted"]]
+    assert [got[2.0, track].status for track in range(5)] == ["confirmed", *4 * ["deleted"]]
     decided = {decision.track: decision.kind for decision in record.decisions}
     assert decided == {0: "confirmed", **dict.fromkeys(range(1, 5), "deleted")}
     said = [

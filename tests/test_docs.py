@@ -10,10 +10,14 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from process_helpers import Processes
+
+from common.health import fault
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 HOW_TO = (ROOT / "docs/how-to/first-network.md").read_text()
+DEPLOY = (ROOT / "docs/how-to/deploy.md").read_text()
 WALDNET = str(Path(sys.executable).with_name("waldnet"))
 
 
@@ -104,6 +108,25 @@ def test_how_to_on_several_machines(folder: Path, way: str) -> None:
         for kind, process in started:
             if kind != "router":
                 assert process.wait(60) == 0, kind
+
+
+@pytest.mark.processes
+def test_how_to_deploy_without_docker(tmp_path: Path) -> None:
+    """As written, but on loopback, with all sensors, and in lockstep; the watcher first, to the end."""
+    router, center, node, watch = commands(section(DEPLOY, "Without Docker"))
+    nodes = [[word.replace("radar-1", f"radar-{number}") for word in node] for number in range(1, 5)]
+    with Processes(tmp_path) as processes:
+        local = [word.replace("0.0.0.0:7447", "127.0.0.1:0") for word in router]
+        (at,) = json.loads(processes.start(*local).await_line("listening"))["listening"]
+        others = [[*watch, "--until-end"], [*center, "--speed", "max"], *nodes]
+        started = [processes.start(*(word.replace("tcp/192.168.1.7:7447", at) for word in words)) for words in others]
+        assert [process.wait() for process in started] == 6 * [0]
+        assert "    2.00 s  track 0 confirmed after 1 scans, log LR +33.33" in started[0].out
+
+
+def test_the_health_shown_is_that_of_a_node() -> None:
+    shown = json.loads(blocks(section(DEPLOY, "Health"), "json")[0])
+    assert fault(shown, 30.0) is None
 
 
 def test_schema_is_the_one_the_program_prints() -> None:

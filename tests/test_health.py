@@ -77,6 +77,7 @@ def test_a_loop_that_is_stuck_is_told_from_one_that_ended(
 
 def test_wrong_words(path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert health.main([]) == 2
+    assert "usage" in capsys.readouterr().err
     assert health.main([str(path), "--max-age", "soon"]) == 1
     assert "soon" in capsys.readouterr().out
 

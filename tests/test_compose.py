@@ -57,25 +57,37 @@ def compose_command() -> tuple[str, ...]:
     pytest.skip(missing)
 
 
-class Containers(NamedTuple):
-    """The network of docker-compose.yml, and one who listens to it from outside."""
+class Project(NamedTuple):
+    """docker-compose.yml with an environment."""
 
     command: tuple[str, ...]
-    project: str
+    name: str
     env: Mapping[str, str]
+
+    def __call__(self, *words: str) -> str:
+        return output(*self.command, *words, env=self.env)
+
+    def take_down(self) -> None:
+        """Nothing of it is left."""
+        self("down", "--volumes", "--rmi", "all")
+        # What the builder of old keeps of the first stage.
+        output("docker", "image", "prune", "--force", "--filter", "label=org.opencontainers.image.title=waldnet")
+        label = f"label=com.docker.compose.project={self.name}"
+        assert output("docker", "ps", "--all", "--quiet", "--filter", label) == ""
+        assert output("docker", "network", "ls", "--quiet", "--filter", label) == ""
+        assert output("docker", "images", "--quiet", self.name) == ""
+
+
+class Containers(NamedTuple):
+    """A network in containers, and one who listens to it from outside."""
+
+    compose: Project
     path: Path
     processes: Processes
-    observers: list[Observer]
-
-    def compose(self, *words: str) -> str:
-        return output(*self.command, *words, env=self.env)
+    observer: Observer
 
     def container(self, service: str) -> str:
         return self.compose("ps", "--all", "--quiet", service).strip()
-
-    @property
-    def observer(self) -> Observer:
-        return self.observers[0]
 
     def await_tracks(self, *missing: str, times: int = 3) -> list[Tracks]:
         """Pictures in which all sensors but some contribute to track 0, one after the other."""
@@ -107,25 +119,16 @@ def containers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Containers]
         "WALDNET_SPEED": "4",
         "WALDNET_WAIT": "60",
     }
+    compose = Project(command, project, env)
     with ExitStack() as stack:
-        containers = Containers(command, project, env, path, stack.enter_context(Processes(folder)), [])
-        stack.callback(take_down, containers)
-        containers.compose("build")
-        containers.compose("up", "-d", "router", "center")
+        processes = stack.enter_context(Processes(folder))
+        stack.callback(compose.take_down)
+        compose("build")
+        compose("up", "-d", "router", "center")
         bus = stack.enter_context(open_zenoh(Network(mode="client", connect=(endpoint,))))
-        containers.observers.append(observe(bus, path))
-        containers.compose("up", "-d")
-        yield containers
-
-
-def take_down(containers: Containers) -> None:
-    containers.compose("down", "--volumes", "--rmi", "all")
-    # What the builder of old keeps of the first stage.
-    output("docker", "image", "prune", "--force", "--filter", "label=org.opencontainers.image.title=waldnet")
-    label = f"label=com.docker.compose.project={containers.project}"
-    assert output("docker", "ps", "--all", "--quiet", "--filter", label) == ""
-    assert output("docker", "network", "ls", "--quiet", "--filter", label) == ""
-    assert output("docker", "images", "--quiet", containers.project) == ""
+        observer = observe(bus, path)
+        compose("up", "-d")
+        yield Containers(compose, path, processes, observer)
 
 
 def test_decides_as_a_replay_does(containers: Containers) -> None:
@@ -148,7 +151,7 @@ def test_decides_as_a_replay_does(containers: Containers) -> None:
 
 def test_all_are_healthy(containers: Containers) -> None:
     service = '{{index .Actor.Attributes "com.docker.compose.service"}} {{.Action}}'
-    label = f"label=com.docker.compose.project={containers.project}"
+    label = f"label=com.docker.compose.project={containers.compose.name}"
     since = str(int(time.time()) - 300)
     filters = ("--filter", label, "--filter", "event=health_status")
     events = containers.processes.start("docker", "events", "--since", since, *filters, "--format", service)
@@ -167,7 +170,7 @@ def test_a_sensor_that_is_stopped_is_not_missed(containers: Containers) -> None:
 
 
 def test_a_sensor_that_is_cut_off_takes_part_again(containers: Containers) -> None:
-    network, container = f"{containers.project}_default", containers.container("radar-3")
+    network, container = f"{containers.compose.name}_default", containers.container("radar-3")
     output("docker", "network", "disconnect", network, container)
     containers.await_tracks("radar-3")
     output("docker", "network", "connect", network, container)

@@ -21,6 +21,9 @@ from sensor_node.tracker import LocalTracker
 
 #: Between two requests to join while no center answers.
 _JOIN_EVERY_NS = 1_000_000_000
+#: So long before a scan the work ahead of it is done: not while a center on the same machine is busy, and late enough
+#: that its results are still in the caches.
+_AHEAD_NS = 10_000_000
 #: With all scans sent, how long a center that is gone may take to come back for the last reports.
 _FAREWELL_NS = 5_000_000_000
 
@@ -81,14 +84,16 @@ class NodeShell:
         """
         self._open()
         while not self._stopped and not self._done():
-            now = time.time_ns()
             due = self._due_ns()
             if self._inbox.empty and due is not None:
-                scan = self._scans[self._position]
-                if due <= now:
+                scan, left_ns = self._scans[self._position], due - time.time_ns()
+                if left_ns <= 0:
                     self._process(scan)
                     continue
-                self._state = self._tracker.prepare(self._state, scan.time_ns, scan.position)
+                if left_ns <= _AHEAD_NS:
+                    self._state = self._tracker.prepare(self._state, scan.time_ns, scan.position)
+                else:
+                    due -= _AHEAD_NS
             self._handle(self._inbox.receive(self._wake_ns(due)))
         self._log.info("ended", scans=self._position, of=len(self._scans), dropped=dict(self.complaints.counts))
 

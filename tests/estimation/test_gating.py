@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.estimation import association
-from common.estimation.association import Clutter, Plots, pdaf, tight
+from common.estimation.association import Clutter, Plots, expect, update
 from common.estimation.gating import inside_boxes
 from common.estimation.gaussian import Gaussian
 from common.estimation.sensing import Position
@@ -32,13 +32,9 @@ def world(tracks: int, plots: int, extent: float = 3e4) -> tuple[Gaussian, Any]:
 def filtered(density: Gaussian, z: Any, p_g: float) -> list[Any]:
     """Both filters, flat."""
     clutter = Clutter(np.full(len(density.x), 0.9), np.array(-15.0), p_g)
-    linear, plots = SENSOR.linearise(density.x, ORIGIN), Plots(z)
-    wider = density._replace(P=4.0 * density.P)
-    (one, log_one), ((two, log_two), three) = (
-        pdaf(density, plots, linear, clutter),
-        tight(wider, density, plots, (linear, linear), clutter),
-    )
-    return [*one, log_one, *two, log_two, *three]
+    both = Gaussian(np.stack([density.x, density.x]), np.stack([4.0 * density.P, density.P]))
+    (x, P), log_p_bar = update(expect(both, SENSOR.linearise(both.x, ORIGIN), clutter), Plots(z))
+    return [x[1], P[1], log_p_bar, x[0], P[0]]
 
 
 @pytest.mark.parametrize(("tracks", "plots"), [(300, 500), (1, 9000), (3000, 2), (80, 80)])

@@ -85,15 +85,11 @@ class NodeShell:
         self._open()
         while not self._stopped and not self._done():
             due = self._due_ns()
-            if self._inbox.empty and due is not None:
-                scan, left_ns = self._scans[self._position], due - time.time_ns()
-                if left_ns <= 0:
-                    self._process(scan)
+            if self._inbox.empty:
+                if due is not None and due <= time.time_ns():
+                    self._process(self._scans[self._position])
                     continue
-                if left_ns <= _AHEAD_NS:
-                    self._state = self._tracker.prepare(self._state, scan.time_ns, scan.position)
-                else:
-                    due -= _AHEAD_NS
+                due = self._work_ahead(due)
             self._handle(self._inbox.receive(self._wake_ns(due)))
         self._log.info("ended", scans=self._position, of=len(self._scans), dropped=dict(self.complaints.counts))
 
@@ -241,6 +237,18 @@ class NodeShell:
             return self._clock.wall_ns + round((time_ns - self._clock.time_ns) / self._clock.speed)
         advised = self._advised_ns is None or self._advised_ns >= self._clock.time_ns
         return 0 if advised and time_ns <= self._clock.clear_ns else None
+
+    def _work_ahead(self, due_ns: int | None) -> int | None:
+        """Prepare the next scan if it is near; returns when there is something to do next."""
+        if self._clock is None or not self._answered or self._exhausted:
+            return due_ns
+        if due_ns is None and self._tracker.advised:  # what is to come would undo it
+            return None
+        if due_ns is not None and due_ns - time.time_ns() > _AHEAD_NS:
+            return due_ns - _AHEAD_NS
+        scan = self._scans[self._position]
+        self._state = self._tracker.prepare(self._state, scan.time_ns, scan.position)
+        return due_ns
 
     def _process(self, scan: Scan) -> None:
         self._position += 1

@@ -209,7 +209,8 @@ class Raw:
         stamps = [sender.hear() for sender in self._senders]
         self._watch.wait(_PATIENCE_S)
         began = np.max(stamps, axis=0)
-        return [(self._watch.arrivals[number] - int(began[number])) / 1e3 for number in range(_WARM_UP, self._cycles)]
+        arrivals = sorted(self._watch.arrivals.items())[_WARM_UP:]
+        return [(at - int(began[number])) / 1e3 for number, at in arrivals]
 
 
 def _sizes(cell: Cell) -> tuple[int, int]:

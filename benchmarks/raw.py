@@ -67,7 +67,8 @@ class ZenohLink(Link):
             "transport": {"shared_memory": {"enabled": False}},
         }
         self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(config)))
-        self._publisher = self._session.declare_publisher(keys[0])
+        # Nothing may be lost, and nobody gets stuck here.
+        self._publisher = self._session.declare_publisher(keys[0], congestion_control=zenoh.CongestionControl.BLOCK)
         if deliver is not None:
             self._session.declare_subscriber(keys[1], lambda sample: deliver(sample.payload.to_bytes()))
 

@@ -20,8 +20,9 @@ from common.logs import configure
 from common.messages import Message, Report, Scan, Tracks
 from common.process import stopped_by_signals
 from common.transport import open_zenoh
-from fusion_center.center import Center, Event
+from fusion_center.center import Center
 from fusion_center.shell import CenterShell
+from fusion_center.state import Event
 from sensor_node.shell import NodeShell
 from sensor_node.tracker import LocalTracker
 

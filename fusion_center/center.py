@@ -10,7 +10,6 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -21,122 +20,13 @@ from common.estimation.sprt import DELETED
 from common.messages import NEVER, Advice, Clock, Decision, Join, Message, Report, Start, Stop, Tracks
 from common.quantities import NS_PER_S
 from fusion_center.picture import Expected, Fuser, Heard, Picture
+from fusion_center.state import Checkpoint, Counts, Event, Member, Presence, State, Waiting
 
 #: Wall time between the clock's announcement and its start: nodes on a slow link hear of it in time.
 _LEAD_NS = 50_000_000
 
 #: No position or speed in m, m/s is larger, and no standard deviation smaller than its inverse.
 _LARGEST = 1e15
-
-
-class Presence(NamedTuple):
-    """A sensor's liveliness token came or went."""
-
-    sensor: str
-    alive: bool
-
-
-class Tick(NamedTuple):
-    """Time has passed."""
-
-
-Event: TypeAlias = Report | Join | Presence | Tick
-
-
-class Member(NamedTuple):
-    """What the center knows of a sensor.
-
-    Attributes:
-        joined: it asked for the tracks.
-        alive: it is there now.
-        incarnation: of its process.
-        epoch: its reports must carry.
-        next_ns: nothing earlier will come from it.
-    """
-
-    joined: bool = False
-    alive: bool = False
-    incarnation: int = 0
-    epoch: int = 0
-    next_ns: int = 0
-
-
-class Checkpoint(NamedTuple):
-    """One measurement time, worked in."""
-
-    time_ns: int
-    reports: Mapping[int, Heard]
-    picture: Picture
-    decisions: tuple[Decision, ...]
-
-
-class Waiting(NamedTuple):
-    """Reports of one measurement time not worked in yet.
-
-    Attributes:
-        reports: by number of the sensor.
-        since_ns: wall time of the first one's arrival.
-    """
-
-    reports: Mapping[int, Heard]
-    since_ns: int
-
-
-class Counts(NamedTuple):
-    """What happened to reports that did not go the straight way.
-
-    Attributes:
-        late: worked in after their time, inside the window.
-        too_late: dropped, older than the window.
-        repeated: dropped, had arrived before.
-        refused: dropped, do not fit this network.
-    """
-
-    late: int = 0
-    too_late: int = 0
-    repeated: int = 0
-    refused: int = 0
-
-
-class State(NamedTuple):
-    """State of the center.
-
-    Attributes:
-        first_join_ns: wall time at which the wait for the other sensors began; None: nobody has joined.
-        clock: once running.
-        members: by number of the sensor.
-        waiting: by measurement time.
-        base: the picture before the oldest checkpoint.
-        base_ns: its time.
-        history: checkpoints inside the window, oldest first.
-        counts: of reports.
-        expected: worked out ahead for the next measurement time, or None. It saves time and changes nothing.
-    """
-
-    first_join_ns: int | None
-    clock: Clock | None
-    members: tuple[Member, ...]
-    waiting: Mapping[int, Waiting]
-    base: Picture
-    base_ns: int
-    history: tuple[Checkpoint, ...]
-    counts: Counts
-    expected: Expected | None = None
-
-    @property
-    def picture(self) -> Picture:
-        """The newest picture."""
-        return self.history[-1].picture if self.history else self.base
-
-    @property
-    def time_ns(self) -> int:
-        """The newest measurement time worked in."""
-        return self.history[-1].time_ns if self.history else self.base_ns
-
-    @property
-    def finished(self) -> bool:
-        """All sources are exhausted and everything is worked in."""
-        return self.clock is not None and self.clock.clear_ns == NEVER
 
 
 @dataclass(frozen=True)
@@ -220,11 +110,11 @@ class Center:
                 state, messages = self._join(state, event)
             case Presence() if event.sensor in self.names:
                 number = self.names.index(event.sensor)
-                state = _with_member(state, number, state.members[number]._replace(alive=event.alive))
+                state = state.with_member(number, state.members[number]._replace(alive=event.alive))
             case Report() if (heard := self._fitting(state, event, now_ns)) is not None:
                 state, messages = self._accept(state, heard, now_ns)
             case Report() | Join():
-                state = _count(state, "refused")
+                state = state.count("refused")
             case _:
                 pass
         state, clock = self._begin(state, now_ns)
@@ -266,7 +156,7 @@ class Center:
         if not member.joined or join.incarnation != member.incarnation:
             epoch = 1 + max(self.first_epoch, *(other.epoch for other in state.members))
         member = Member(joined=True, alive=True, incarnation=join.incarnation, epoch=epoch, next_ns=join.next_ns)
-        state = _with_member(state, number, member)
+        state = state.with_member(number, member)
         answer: list[Message] = [self._start(state.picture, number, epoch)]
         if state.clock is not None:
             advice = self._advice(self.tracks(state)) if state.history else []
@@ -322,12 +212,12 @@ class Center:
         number = self.names.index(report.sensor)
         member = state.members[number]
         # It does not show that its sensor is there: the end of a token may overtake the last reports.
-        state = _with_member(state, number, member._replace(next_ns=max(member.next_ns, report.next_ns)))
+        state = state.with_member(number, member._replace(next_ns=max(member.next_ns, report.next_ns)))
         if report.time_ns <= state.time_ns:
             return self._late(state, number, heard)
         waiting = state.waiting.get(report.time_ns, Waiting({}, now_ns))
         if number in waiting.reports:
-            return _count(state, "repeated"), []
+            return state.count("repeated"), []
         waiting = waiting._replace(reports={**waiting.reports, number: heard})
         return state._replace(waiting={**state.waiting, report.time_ns: waiting}), []
 
@@ -335,15 +225,15 @@ class Center:
         """Give a late report its place and compute anew from there on."""
         report = heard.report
         if report.time_ns <= state.base_ns:
-            return _count(state, "too_late"), []
+            return state.count("too_late"), []
         at = bisect_left(state.history, report.time_ns, key=lambda checkpoint: checkpoint.time_ns)
         groups = {checkpoint.time_ns: checkpoint.reports for checkpoint in state.history[at:]}
         group = groups.get(report.time_ns, {})
         if number in group:
-            return _count(state, "repeated"), []
+            return state.count("repeated"), []
         groups[report.time_ns] = {**group, number: heard}
         before = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
-        state = _count(state._replace(history=state.history[:at]), "late")
+        state = state._replace(history=state.history[:at]).count("late")
         pictures: list[Message] = []
         for time_ns in sorted(groups):
             state = self._work_in(state, time_ns, groups[time_ns])
@@ -462,15 +352,6 @@ def _sound(report: Report) -> Heard | None:
         return Heard.of(report)
     except np.linalg.LinAlgError:
         return None
-
-
-def _with_member(state: State, number: int, member: Member) -> State:
-    members = (*state.members[:number], member, *state.members[number + 1 :])
-    return state._replace(members=members)
-
-
-def _count(state: State, what: str) -> State:
-    return state._replace(counts=state.counts._replace(**{what: getattr(state.counts, what) + 1}))
 
 
 def _corrections(before: list[Decision], after: list[Decision]) -> list[Message]:

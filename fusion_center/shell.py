@@ -14,7 +14,8 @@ from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Decision, Join, Keys, Message, Report, Tracks, sensor_of
 from common.transport import Bus, Publisher
-from fusion_center.center import Center, Event, Presence, Tick
+from fusion_center.center import Center
+from fusion_center.state import Event, Presence, Tick
 
 #: How long a finished center stays for nodes that have not heard of the end yet.
 _LINGER_NS = 2_000_000_000

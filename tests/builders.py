@@ -10,8 +10,9 @@ import numpy as np
 from common.config import Scenario
 from common.messages import NEVER, Clock, Decision, Join, Message, Report, Scan, Start, Tracks
 from common.quantities import NS_PER_S
-from fusion_center.center import Center, Event, Tick
-from fusion_center.center import State as CenterState
+from fusion_center.center import Center
+from fusion_center.state import Event, Tick
+from fusion_center.state import State as CenterState
 from sensor_node.sources import schedule_of
 from sensor_node.tracker import LocalTracker, Schedule
 from sensor_node.tracker import State as NodeState

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from common.config import Scenario
 from common.messages import NEVER, Advice, Clock, Decision, Join, Report, Scan, Start, Stop, Tracks
 from common.quantities import NS_PER_S
-from fusion_center.center import Presence
+from fusion_center.state import Presence
 from scenarios.world import simulate, simulate_all
 from studies.replay import Replay
 

@@ -44,7 +44,7 @@ from common.estimation.sprt import Status
 from common.messages import Clock, Join, Keys, Report, Scan, Start, Tracks
 from common.quantities import NS_PER_S
 from common.transport import open_zenoh
-from fusion_center.center import Presence
+from fusion_center.state import Presence
 from scenarios.catalogue import find
 from sensor_node.sources import all_scans
 from studies.lines import TrackLines

@@ -1,0 +1,127 @@
+"""What the center keeps between two steps, and the events that move it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple, TypeAlias
+
+from common.messages import NEVER, Clock, Decision, Join, Report
+from fusion_center.picture import Expected, Heard, Picture
+
+
+class Presence(NamedTuple):
+    """A sensor's liveliness token came or went."""
+
+    sensor: str
+    alive: bool
+
+
+class Tick(NamedTuple):
+    """Time has passed."""
+
+
+Event: TypeAlias = Report | Join | Presence | Tick
+
+
+class Member(NamedTuple):
+    """What the center knows of a sensor.
+
+    Attributes:
+        joined: it asked for the tracks.
+        alive: it is there now.
+        incarnation: of its process.
+        epoch: its reports must carry.
+        next_ns: nothing earlier will come from it.
+    """
+
+    joined: bool = False
+    alive: bool = False
+    incarnation: int = 0
+    epoch: int = 0
+    next_ns: int = 0
+
+
+class Checkpoint(NamedTuple):
+    """One measurement time, worked in."""
+
+    time_ns: int
+    reports: Mapping[int, Heard]
+    picture: Picture
+    decisions: tuple[Decision, ...]
+
+
+class Waiting(NamedTuple):
+    """Reports of one measurement time not worked in yet.
+
+    Attributes:
+        reports: by number of the sensor.
+        since_ns: wall time of the first one's arrival.
+    """
+
+    reports: Mapping[int, Heard]
+    since_ns: int
+
+
+class Counts(NamedTuple):
+    """What happened to reports that did not go the straight way.
+
+    Attributes:
+        late: worked in after their time, inside the window.
+        too_late: dropped, older than the window.
+        repeated: dropped, had arrived before.
+        refused: dropped, do not fit this network.
+    """
+
+    late: int = 0
+    too_late: int = 0
+    repeated: int = 0
+    refused: int = 0
+
+
+class State(NamedTuple):
+    """State of the center.
+
+    Attributes:
+        first_join_ns: wall time at which the wait for the other sensors began; None: nobody has joined.
+        clock: once running.
+        members: by number of the sensor.
+        waiting: by measurement time.
+        base: the picture before the oldest checkpoint.
+        base_ns: its time.
+        history: checkpoints inside the window, oldest first.
+        counts: of reports.
+        expected: worked out ahead for the next measurement time, or None. It saves time and changes nothing.
+    """
+
+    first_join_ns: int | None
+    clock: Clock | None
+    members: tuple[Member, ...]
+    waiting: Mapping[int, Waiting]
+    base: Picture
+    base_ns: int
+    history: tuple[Checkpoint, ...]
+    counts: Counts
+    expected: Expected | None = None
+
+    @property
+    def picture(self) -> Picture:
+        """The newest picture."""
+        return self.history[-1].picture if self.history else self.base
+
+    @property
+    def time_ns(self) -> int:
+        """The newest measurement time worked in."""
+        return self.history[-1].time_ns if self.history else self.base_ns
+
+    @property
+    def finished(self) -> bool:
+        """All sources are exhausted and everything is worked in."""
+        return self.clock is not None and self.clock.clear_ns == NEVER
+
+    def with_member(self, number: int, member: Member) -> State:
+        """The state with another opinion of a sensor."""
+        return self._replace(members=(*self.members[:number], member, *self.members[number + 1 :]))
+
+    def count(self, what: str) -> State:
+        """The state with one more report of a kind of ``Counts``."""
+        return self._replace(counts=self.counts._replace(**{what: getattr(self.counts, what) + 1}))

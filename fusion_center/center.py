@@ -114,7 +114,7 @@ class Center:
             case Report() if (heard := self._fitting(state, event, now_ns)) is not None:
                 state, messages = self._accept(state, heard, now_ns)
             case Report() | Join():
-                state = state.count("refused")
+                state = state.counted("refused")
             case _:
                 pass
         state, clock = self._begin(state, now_ns)
@@ -217,7 +217,7 @@ class Center:
             return self._late(state, number, heard)
         waiting = state.waiting.get(report.time_ns, Waiting({}, now_ns))
         if number in waiting.reports:
-            return state.count("repeated"), []
+            return state.counted("repeated"), []
         waiting = waiting._replace(reports={**waiting.reports, number: heard})
         return state._replace(waiting={**state.waiting, report.time_ns: waiting}), []
 
@@ -225,15 +225,15 @@ class Center:
         """Give a late report its place and compute anew from there on."""
         report = heard.report
         if report.time_ns <= state.base_ns:
-            return state.count("too_late"), []
+            return state.counted("too_late"), []
         at = bisect_left(state.history, report.time_ns, key=lambda checkpoint: checkpoint.time_ns)
         groups = {checkpoint.time_ns: checkpoint.reports for checkpoint in state.history[at:]}
         group = groups.get(report.time_ns, {})
         if number in group:
-            return state.count("repeated"), []
+            return state.counted("repeated"), []
         groups[report.time_ns] = {**group, number: heard}
         before = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
-        state = state._replace(history=state.history[:at]).count("late")
+        state = state._replace(history=state.history[:at]).counted("late")
         pictures: list[Message] = []
         for time_ns in sorted(groups):
             state = self._work_in(state, time_ns, groups[time_ns])

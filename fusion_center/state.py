@@ -122,6 +122,6 @@ class State(NamedTuple):
         """The state with another opinion of a sensor."""
         return self._replace(members=(*self.members[:number], member, *self.members[number + 1 :]))
 
-    def count(self, what: str) -> State:
+    def counted(self, what: str) -> State:
         """The state with one more report of a kind of ``Counts``."""
         return self._replace(counts=self.counts._replace(**{what: getattr(self.counts, what) + 1}))

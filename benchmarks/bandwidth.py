@@ -161,6 +161,8 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             axes.loglog(at, [row["reports_bytes_per_scan"] for row in mine], style, label=f"reports, {codec}")
         for what, style in (("plots", "--^"), ("proposals", ":v")):
             axes.loglog(at, [row[f"{what}_bytes_per_scan"] for row in mine], style, label=what)
+        axes.set_xticks(values := sorted({row[axis] for row in along}), map(str, values), minor=False)
+        axes.minorticks_off()
         axes.set(xlabel=title, title=", ".join(f"{titles[key]} {value}" for key, value in rest.items()))
         axes.grid(visible=True, which="major", alpha=0.3)
     figure.axes[0].set_ylabel("bytes on the wire per sensor and scan")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -12,7 +14,9 @@ import pytest
 from builders import scenario
 from process_helpers import Processes
 
-from benchmarks.bandwidth import draw, table
+from benchmarks.bandwidth import draw, measure, table
+from benchmarks.crew import BenchError, Crew
+from benchmarks.namespaces import Namespaces
 from benchmarks.precision import compare
 from benchmarks.traffic import messages
 from benchmarks.worlds import World
@@ -93,6 +97,27 @@ def test_bandwidth_counts_payload_and_wire(processes: Processes, tmp_path: Path)
     assert figure.read_bytes().startswith(b"\x89PNG")
     assert table(rows).count("float32") == 2
     draw([], tmp_path / "empty.png")
+
+
+def test_a_machine_without_namespaces_is_told_what_it_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Namespaces, "lacking", lambda: "root, nsenter")
+    with pytest.raises(BenchError, match="network namespaces, for which this machine lacks root, nsenter"):
+        next(measure([SMALL], scans=1, interval_s=0.1))
+
+
+def test_a_process_of_a_benchmark_that_fails_says_why() -> None:
+    with Crew() as crew, pytest.raises(BenchError, match=r"benchmarks\.raw relay: ended with exit code 1: .*Error"):
+        crew.start("benchmarks.raw", "relay").hear()
+
+
+def test_figures_are_put_where_the_document_names_their_command(tmp_path: Path) -> None:
+    document = tmp_path / "figures.md"
+    places = [f"<!-- figures: echo {word} -->\nold\n<!-- end -->" for word in ("one", "two")]
+    document.write_text("\n\n".join(places))
+    subprocess.run([sys.executable, "-m", "benchmarks.figures", document, "one"], check=True)
+    text = document.read_text()
+    assert "<!-- figures: echo one -->\n\none\n\n<!-- end -->" in text
+    assert places[1] in text
 
 
 def test_float32_reports_hardly_change_log_lr_in_1000_scans() -> None:

@@ -78,11 +78,11 @@ def waldnet_scan(tracks: int, *, tightly: bool) -> Callable[[], object]:
     def scan() -> object:
         predicted = share.predict(factor, MOTION, dt)
         if not tightly:
-            filtered = pdaf(predicted, plots, SENSOR.linearise(predicted.x, origin), clutter)
+            filtered = pdaf(predicted, plots, SENSOR.linearise(predicted, origin), clutter)
             return log_p_bar + filtered.log_p_bar
         pairs = zip(predicted, honest.predict(prior, MOTION, dt), strict=True)
         both = Gaussian(*(np.stack(pair) for pair in pairs))
-        filtered = update(expect(both, SENSOR.linearise(both.x, origin), clutter), plots)
+        filtered = update(expect(both, SENSOR.linearise(both, origin), clutter), plots)
         return log_p_bar + filtered.log_p_bar
 
     return scan

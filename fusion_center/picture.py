@@ -270,10 +270,11 @@ class Fuser:
     def _shrunk(self, network_P: Array, reports: Mapping[int, Heard]) -> Array:
         network_P = network_P.copy()
         for number in reports:
+            P = network_P[:, number]
             linear = self.sensors[number].measurement.linearise(
-                np.zeros(self.motion.n), np.zeros(self.motion.dimensions)
+                Gaussian(np.zeros(P.shape[:-1]), P), np.zeros(self.motion.dimensions)
             )
-            network_P[:, number] = shrink(network_P[:, number], linear.H, linear.R)
+            network_P[:, number] = shrink(P, linear.H, linear.R)
         return network_P
 
     def _decide(self, picture: Picture) -> tuple[Picture, list[Decision]]:

@@ -101,10 +101,14 @@ def _scan(scenario: Scenario, config: SensorConfig, t_ns: int, states: Array, rn
     center = config.view_center(stand)
     there = states[~np.isnan(states).any(axis=-1)]
     seen = sensor.field_of_view.contains(there[:, : len(stand)], center) & (rng.random(len(there)) < sensor.p_d)
-    linear = sensor.measurement.linearise(there[seen], stand)
-    noise = rng.multivariate_normal(np.zeros(sensor.measurement.m), linear.R, size=int(seen.sum()))
+    noise = rng.multivariate_normal(np.zeros(sensor.measurement.m), sensor.measurement.R, size=int(seen.sum()))
     false = sensor.field_of_view.draw(rng, int(rng.poisson(sensor.false_plots)), center)
-    return Scan(config.name, t_ns, stand, rng.permutation(np.concatenate([linear.z + noise, false])))
+    return Scan(
+        config.name,
+        t_ns,
+        stand,
+        rng.permutation(np.concatenate([sensor.measurement.observe(there[seen], stand) + noise, false])),
+    )
 
 
 def simulate_all(scenario: Scenario, seed: int) -> list[Scan]:

@@ -261,7 +261,7 @@ class LocalTracker:
                 predicted = HONEST.predict(
                     Gaussian(x_a[due], P_a[due]), self.motion, _interval(times[due], scan.time_ns)
                 )
-                linear = self.sensor.measurement.linearise(predicted.x, scan.position)
+                linear = self.sensor.measurement.linearise(predicted, scan.position)
                 filtered = pdaf(predicted, Plots(scan.z), linear, self._clutter(predicted, scan.position))
                 (x_a[due], P_a[due]), times[due] = filtered.density, scan.time_ns
         return tracks._replace(x_a=x_a, P_a=P_a, times_a_ns=times)
@@ -295,7 +295,7 @@ class LocalTracker:
             association = HONEST.predict(association, self.motion, _interval(tracks.times_a_ns, time_ns))
             filters.append(association)
         both = Gaussian(*(np.stack(arrays) for arrays in zip(*filters, strict=True)))
-        linear = self.sensor.measurement.linearise(both.x, position)
+        linear = self.sensor.measurement.linearise(both, position)
         predicted = Tracks(tracks.ids, now, tracks.log_p_bar, *factor, now, *association, network_P)
         return predicted, expect(both, linear, self._clutter(filters[-1], position))
 
@@ -306,7 +306,7 @@ class LocalTracker:
         return tracks._replace(x_a=x[1], P_a=P[1]) if self.tight else tracks
 
     def _clutter(self, density: Gaussian, position: Array) -> Clutter:
-        p_d = self.sensor.detection_probability(density, self.config.view_center(position))
+        p_d = self.sensor.detection_probability(density, position, self.config.view_center(position))
         return Clutter(p_d, np.array(self.sensor.log_rho_f), self.gate_probability)
 
     def _predict_factors(self, tracks: Tracks, t_ns: int) -> tuple[Gaussian, Array]:
@@ -330,7 +330,9 @@ class LocalTracker:
             x[due], P[due] = self.share.predict(Gaussian(x_own, common.P), self.motion, _interval(times[due], event_ns))
             network_P[due] = P[due][:, None]
             for number in scanning:
-                linear = self.sensors[number].measurement.linearise(x[due], np.zeros(self.motion.dimensions))
+                linear = self.sensors[number].measurement.linearise(
+                    Gaussian(x[due], P[due]), np.zeros(self.motion.dimensions)
+                )
                 network_P[due, number] = shrink(P[due], linear.H, linear.R)
             times[due] = event_ns
         return Gaussian(x, P), network_P

@@ -10,8 +10,9 @@ surely the target's, plus ``W (p_0 I + spread of the w_j) W'``: sums of positive
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -43,10 +44,13 @@ class Plots(NamedTuple):
     Attributes:
         z: shape (..., M, m).
         valid: shape (..., M); false marks padding. None: there is none.
+        log_relative: log of the density of false plots where a plot lies, relative to ``Clutter.log_rho_f``, shape
+            (..., M). None: it is the same everywhere.
     """
 
     z: Array
     valid: BoolArray | None = None
+    log_relative: Array | None = None
 
 
 class Clutter(NamedTuple):
@@ -79,6 +83,7 @@ class Expected(NamedTuple):
         log_miss: log p*_0 (Eq. 6), shape (...).
         log_hit: log (p_d / rho_f), shape (...).
         gate: squared Mahalanobis distance up to which a plot counts.
+        angular: which numbers of a plot are angles.
     """
 
     density: Gaussian
@@ -90,6 +95,11 @@ class Expected(NamedTuple):
     log_miss: Array
     log_hit: Array
     gate: float
+    angular: tuple[int, ...]
+
+
+#: Weights p_j, shape (..., 1 + M), and log p_bar, shape (...), from log p*_j, shape (..., 1 + M).
+Choice: TypeAlias = Callable[[Array], tuple[Array, Array]]
 
 
 class Filtered(NamedTuple):
@@ -130,72 +140,8 @@ def expect(predicted: Gaussian, sensor: Linearised, clutter: Clutter) -> Expecte
         log_miss=_log(1.0 - clutter.p_d * clutter.p_g),
         log_hit=_log(clutter.p_d) - clutter.log_rho_f,
         gate=gate_threshold(clutter.p_g, m),
+        angular=sensor.angular,
     )
-
-
-def update(expected: Expected, plots: Plots) -> Filtered:
-    """Filter one scan (Eq. 6, 7; with two filters Eq. 12, 13).
-
-    Args:
-        expected: tracks, predicted to the time of the scan.
-        plots: of the scan; no plots is evidence too.
-
-    Returns:
-        posteriors of all filters, shapes (F, ..., n), (F, ..., n, n), and log p_bar of the first, shape (...).
-    """
-    plots = _within_reach(expected, plots)
-    nu = plots.z - expected.z[..., None, :]
-    if plots.valid is not None:
-        # Padding may hold anything, and 0 times NaN is no zero.
-        nu = np.where(plots.valid[..., None], nu, 0.0)
-    w = times_transposed(nu, expected.whitener)
-    distance = squared_norm(w)
-    log_pdf = expected.log_peak[..., None] - 0.5 * distance
-    inside = distance[-1] <= expected.gate
-    if plots.valid is not None:
-        inside &= plots.valid
-    q, log_q_bar = normalise(log_weights(expected, log_pdf[-1], inside))
-    # Eq. (13): with log q_j = log (weight j) - log q_bar, only the densities of the plots do not cancel.
-    log_p_bar = log_q_bar + np.vecdot(q[..., 1:], log_pdf[0] - log_pdf[-1])
-    return Filtered(absorb(expected, w, q), log_p_bar)
-
-
-def _within_reach(expected: Expected, plots: Plots) -> Plots:
-    """For many tracks and the many plots of one scan, the plots inside the box around each track's gate.
-
-    With all plots the result would be the same, in a time that grows with the product of tracks and plots.
-    """
-    shared = plots.valid is None and plots.z.ndim == 2 and expected.z.ndim == 3
-    if not shared or len(plots.z) * expected.z.shape[1] <= _FEW_PAIRS or expected.gate == np.inf:
-        return plots
-    L = np.linalg.inv(expected.whitener[-1])
-    # A little more, so that rounding loses none.
-    reach = np.sqrt(expected.gate * np.square(L).sum(axis=-1)) * (1.0 + 1e-9)
-    near = inside_boxes(plots.z, expected.z[-1], reach)
-    return Plots(plots.z[near.which], near.valid)
-
-
-@cache
-def gate_threshold(p_g: float, m: int) -> float:
-    """Squared Mahalanobis distance that an m-dimensional plot of the target stays below with probability ``p_g``."""
-    return float(2.0 * gammaincinv(m / 2.0, p_g))
-
-
-def log_weights(expected: Expected, log_pdf: Array, inside: BoolArray) -> Array:
-    """Logarithms of the unnormalised weights p*_j (Eq. 6), j = 0 the missed detection.
-
-    Args:
-        expected: the tracks.
-        log_pdf: log N(z_j; H x, S_k) of the filter that associates, shape (..., M).
-        inside: plots that count, shape (..., M).
-
-    Returns:
-        log p*_j, shape (..., 1 + M); -inf for impossible hypotheses.
-    """
-    weights = np.empty((*log_pdf.shape[:-1], 1 + log_pdf.shape[-1]))
-    weights[..., 0] = expected.log_miss
-    weights[..., 1:] = np.where(inside, expected.log_hit[..., None] + log_pdf, -np.inf)
-    return weights
 
 
 def normalise(log_p_star: Array) -> tuple[Array, Array]:
@@ -213,6 +159,101 @@ def normalise(log_p_star: Array) -> tuple[Array, Array]:
     p /= p_bar
     p[..., :1] += impossible
     return p, np.where(impossible, -np.inf, top + np.log(p_bar))[..., 0]
+
+
+def update(expected: Expected, plots: Plots, choose: Choice = normalise) -> Filtered:
+    """Filter one scan (Eq. 6, 7; with two filters Eq. 12, 13).
+
+    Args:
+        expected: tracks, predicted to the time of the scan.
+        plots: of the scan; no plots is evidence too.
+        choose: how much each hypothesis counts: PDAF, nearest neighbour, or Kalman with a gate.
+
+    Returns:
+        posteriors of all filters, shapes (F, ..., n), (F, ..., n, n), and log p_bar of the first, shape (...).
+    """
+    plots = _within_reach(expected, plots)
+    nu = innovations(expected, plots)
+    w = times_transposed(nu, expected.whitener)
+    distance = squared_norm(w)
+    log_pdf = expected.log_peak[..., None] - 0.5 * distance
+    inside = distance[-1] <= expected.gate
+    if plots.valid is not None:
+        inside &= plots.valid
+    q, log_q_bar = choose(log_weights(expected, log_pdf[-1], inside, plots.log_relative))
+    # Eq. (13): with log q_j = log (weight j) - log q_bar, only the densities of the plots do not cancel.
+    log_p_bar = log_q_bar + np.vecdot(q[..., 1:], log_pdf[0] - log_pdf[-1])
+    return Filtered(absorb(expected, w, q), log_p_bar)
+
+
+def innovations(expected: Expected, plots: Plots) -> Array:
+    """``nu_j = z_j - H x``, angles around the circle, shape (F, ..., M, m); 0 for padding."""
+    nu = plots.z - expected.z[..., None, :]
+    for i in expected.angular:
+        nu[..., i] = np.remainder(nu[..., i] + np.pi, 2.0 * np.pi) - np.pi
+    # Padding may hold anything, and 0 times NaN is no zero.
+    return nu if plots.valid is None else np.where(plots.valid[..., None], nu, 0.0)
+
+
+def _within_reach(expected: Expected, plots: Plots) -> Plots:
+    """For many tracks and the many plots of one scan, the plots inside the box around each track's gate.
+
+    With all plots the result would be the same, in a time that grows with the product of tracks and plots.
+    """
+    shared = plots.valid is None and plots.z.ndim == 2 and expected.z.ndim == 3
+    if not shared or len(plots.z) * expected.z.shape[1] <= _FEW_PAIRS or expected.gate == np.inf or expected.angular:
+        return plots
+    L = np.linalg.inv(expected.whitener[-1])
+    # A little more, so that rounding loses none.
+    reach = np.sqrt(expected.gate * np.square(L).sum(axis=-1)) * (1.0 + 1e-9)
+    near = inside_boxes(plots.z, expected.z[-1], reach)
+    relative = plots.log_relative
+    return Plots(plots.z[near.which], near.valid, None if relative is None else relative[near.which])
+
+
+@cache
+def gate_threshold(p_g: float, m: int) -> float:
+    """Squared Mahalanobis distance that an m-dimensional plot of the target stays below with probability ``p_g``."""
+    return float(2.0 * gammaincinv(m / 2.0, p_g))
+
+
+def log_weights(expected: Expected, log_pdf: Array, inside: BoolArray, log_relative: Array | None = None) -> Array:
+    """Logarithms of the unnormalised weights p*_j (Eq. 6), j = 0 the missed detection.
+
+    Args:
+        expected: the tracks.
+        log_pdf: log N(z_j; H x, S_k) of the filter that associates, shape (..., M).
+        inside: plots that count, shape (..., M).
+        log_relative: density of false plots at the plots, see ``Plots``.
+
+    Returns:
+        log p*_j, shape (..., 1 + M); -inf for impossible hypotheses.
+    """
+    weights = np.empty((*log_pdf.shape[:-1], 1 + log_pdf.shape[-1]))
+    weights[..., 0] = expected.log_miss
+    log_hit = expected.log_hit[..., None] if log_relative is None else expected.log_hit[..., None] - log_relative
+    weights[..., 1:] = np.where(inside, log_hit + log_pdf, -np.inf)
+    return weights
+
+
+def nearest(log_p_star: Array) -> tuple[Array, Array]:
+    """Nearest neighbour: the heaviest hypothesis, missed detection included, counts alone (theory.md §9).
+
+    Args and returns are those of ``normalise``; log p_bar is the logarithm of that hypothesis' weight.
+    """
+    best = log_p_star.argmax(axis=-1)[..., None]
+    log_p_bar = np.take_along_axis(log_p_star, best, axis=-1)
+    p = np.zeros_like(log_p_star)
+    np.put_along_axis(p, np.where(log_p_bar == -np.inf, 0, best), 1.0, axis=-1)
+    return p, log_p_bar[..., 0]
+
+
+def kalman(log_p_star: Array) -> tuple[Array, Array]:
+    """Kalman filter with a gate: the closest plot in the gate is the target's; none there is a missed detection."""
+    hit = (log_p_star[..., 1:] > -np.inf).any(axis=-1)
+    certain = log_p_star.copy()
+    certain[..., 0] = np.where(hit, -np.inf, certain[..., 0])
+    return nearest(certain)
 
 
 def absorb(expected: Expected, w: Array, p: Array) -> Gaussian:

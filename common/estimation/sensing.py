@@ -11,17 +11,19 @@ from common.estimation.gaussian import Array, Gaussian
 
 
 class Linearised(NamedTuple):
-    """A measurement function linearised at a state.
+    """A measurement function linearised where a track is expected.
 
     Attributes:
         z: expected plot, shape (..., m).
         H: Jacobian, shape (..., m, n) or (m, n).
-        R: noise covariance, shape (m, m).
+        R: noise covariance, shape (..., m, m) or (m, m).
+        angular: which numbers of a plot are angles, whose differences are taken around the circle.
     """
 
     z: Array
     H: Array
     R: Array
+    angular: tuple[int, ...] = ()
 
 
 class Measurement(Protocol):
@@ -32,8 +34,17 @@ class Measurement(Protocol):
         """Size of a plot."""
         ...
 
-    def linearise(self, x: Array, origin: Array) -> Linearised:
-        """Expected plot, Jacobian and noise at states ``x``, shape (..., n), seen from ``origin``."""
+    @property
+    def R(self) -> Array:
+        """Measurement noise, shape (m, m)."""
+        ...
+
+    def observe(self, x: Array, origin: Array) -> Array:
+        """The plot of states ``x`` without noise, seen from ``origin``, shapes (..., n), (d,) to (..., m)."""
+        ...
+
+    def linearise(self, density: Gaussian, origin: Array) -> Linearised:
+        """Expected plot, Jacobian and noise where states are distributed as ``density``, seen from ``origin``."""
         ...
 
 
@@ -63,9 +74,13 @@ class Position(NamedTuple):
         """Measurement noise [m^2], shape (m, m)."""
         return np.diag(np.square(self.sigma))
 
-    def linearise(self, x: Array, origin: Array) -> Linearised:  # noqa: ARG002 (a position is seen from anywhere)
-        """Expected plot, Jacobian and noise at states ``x``, shape (..., n)."""
-        return Linearised(x[..., : self.m], self.H, self.R)
+    def observe(self, x: Array, origin: Array) -> Array:  # noqa: ARG002 (a position is seen from anywhere)
+        """The position of states ``x``, shape (..., n) to (..., m)."""
+        return x[..., : self.m]
+
+    def linearise(self, density: Gaussian, origin: Array) -> Linearised:
+        """Expected plot, Jacobian and noise: exact, as a position is linear in the state."""
+        return Linearised(self.observe(density.x, origin), self.H, self.R)
 
 
 class Sensor(NamedTuple):
@@ -88,11 +103,12 @@ class Sensor(NamedTuple):
         """Logarithm of the density of false plots [1/volume of z]."""
         return float(np.log(self.false_plots) - np.log(self.field_of_view.volume))
 
-    def detection_probability(self, state: Gaussian, center: Array) -> Array:
+    def detection_probability(self, state: Gaussian, stand: Array, center: Array) -> Array:  # noqa: ARG002
         """``p_d`` weighted by the probability that the state lies inside the field of view.
 
         Args:
             state: predicted states, shapes (..., n), (..., n, n), position first.
+            stand: where the sensor stands [m], shape (d,).
             center: of the field of view [m], shape (..., d).
 
         Returns:

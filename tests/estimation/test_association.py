@@ -49,7 +49,7 @@ class Textbook(NamedTuple):
 
 
 def seen_by(density: Gaussian, sensor: Position = SENSOR) -> Linearised:
-    return sensor.linearise(density.x, NOWHERE)
+    return sensor.linearise(density, NOWHERE)
 
 
 def clutter(p_d: float | Array, rho_f: float = 1e-3, p_g: float = 1.0) -> Clutter:

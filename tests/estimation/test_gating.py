@@ -33,7 +33,7 @@ def filtered(density: Gaussian, z: Any, p_g: float) -> list[Any]:
     """Both filters, flat."""
     clutter = Clutter(np.full(len(density.x), 0.9), np.array(-15.0), p_g)
     both = Gaussian(np.stack([density.x, density.x]), np.stack([4.0 * density.P, density.P]))
-    (x, P), log_p_bar = update(expect(both, SENSOR.linearise(both.x, ORIGIN), clutter), Plots(z))
+    (x, P), log_p_bar = update(expect(both, SENSOR.linearise(both, ORIGIN), clutter), Plots(z))
     return [x[1], P[1], log_p_bar, x[0], P[0]]
 
 

@@ -26,6 +26,7 @@ from common.messages import (
     Join,
     Message,
     Proposal,
+    Rebase,
     Report,
     Scan,
     Start,
@@ -34,7 +35,7 @@ from common.messages import (
     sensor_of,
 )
 
-VERSION = 1
+VERSION = 2
 
 
 class Block(NamedTuple):
@@ -102,6 +103,7 @@ LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
     ),
     9: (Decision, ()),
     11: (Proposal, (_floats("x", "T", "n"), _floats("P", "T", "n^"))),
+    12: (Rebase, (_IDS, _floats("x", "T", "n"), _floats("P", "T", "n^"))),
 }
 _KINDS = {message: kind for kind, (message, _) in LAYOUTS.items() if kind != ROUNDED}
 #: No state is larger; keeps a forged header from asking for memory.

@@ -14,8 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from common.errors import ConfigError
+from common.estimation.association import Choice, kalman, nearest, normalise
 from common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
 from common.estimation.gaussian import Array, Gaussian
+from common.estimation.mixture import Reduction
 from common.estimation.motion import ConstantVelocity, Motion
 from common.estimation.representation import Share
 from common.estimation.sensing import Position, Sensor
@@ -35,6 +37,8 @@ from common.quantities import (
     Probability,
     Seconds,
 )
+
+CHOICES: dict[str, Choice] = {"kalman": kalman, "nearest": nearest, "pdaf": normalise}
 
 
 class _Model(BaseModel):
@@ -87,14 +91,35 @@ class DecisionConfig(_Model):
         return thresholds(self.p0, self.p1)
 
 
+class MixtureConfig(_Model):
+    """How far the mixture of a track may grow (theory.md §9).
+
+    Attributes:
+        components: most components of a track.
+        prune: hypotheses lighter than this share of the heaviest are dropped.
+        combine: hypotheses closer than this to a heavier one (squared Mahalanobis distance) are combined with it.
+    """
+
+    components: Annotated[int, Field(ge=1, le=1000, strict=True)] = 15
+    prune: Annotated[NotNegative, Field(lt=1.0)] = 1e-4
+    combine: NotNegative = 0.5
+
+    def build(self) -> Reduction:
+        """The reduction of mixtures."""
+        return Reduction(self.components, self.prune, self.combine)
+
+
 class FusionConfig(_Model):
     """How the network shares a density and who associates.
 
     Attributes:
         mode: representation of the product (theory.md §4).
-        association: the factor's own, or tight (theory.md §5).
-        feedback: advice gives the fused track back to the association filters (theory.md §6).
-        filter: local filter.
+        association: the factor's own, tight, or mirrored: hypotheses kept in both filters (theory.md §5).
+        terms: most terms of a track in a report; more than one only where association is mirrored.
+        feedback: advice gives the fused track back to the association filters, reset to the factors (theory.md §3, 6).
+        feedback_delay: measurement time that goes by before the center gives feedback [s], to study slow links.
+        filter: local filter; default: mht where association is mirrored, else pdaf.
+        mixture: of filter mht.
         precision: of means and covariances in reports; float32 halves them.
         gate_probability: that the target's plot lies inside the gate; 1 is no gate.
         hold_back: how long the center waits for a sensor that is overdue [s].
@@ -102,13 +127,23 @@ class FusionConfig(_Model):
     """
 
     mode: Literal["naive", "federated", "dkf"] = "federated"
-    association: Literal["factor", "tight"] = "tight"
-    feedback: Literal["none", "advice"] = "none"
-    filter: Literal["pdaf"] = "pdaf"
+    association: Literal["factor", "tight", "mirrored"] = "tight"
+    terms: Annotated[int, Field(ge=1, le=64, strict=True)] = 1
+    feedback: Literal["none", "advice", "reset"] = "none"
+    feedback_delay: NotNegative = 0.0
+    filter: Literal["kalman", "nearest", "pdaf", "mht"] | None = None
+    mixture: MixtureConfig = MixtureConfig()
     precision: Literal["float64", "float32"] = "float64"
     gate_probability: GateProbability = 0.9997
     hold_back: NotNegative = 0.5
     window: NotNegative = 10.0
+
+    @property
+    def choice(self) -> Choice | None:
+        """How a single Gaussian is associated; None: hypotheses are kept in a mixture."""
+        if self.association == "mirrored" or self.filter == "mht":
+            return None
+        return CHOICES[self.filter or "pdaf"]
 
 
 class EverywhereConfig(_Model):
@@ -395,9 +430,29 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
         elif isinstance(drawn, int) and drawn >= len(hypotheses):
             yield f"target.{i}.hypothesis: {drawn} is not one of the {len(hypotheses)} hypotheses (counted from 0)"
     yield from _decision_faults(_table(data, "decision"))
-    fusion = _table(data, "fusion")
-    if fusion.get("feedback") == "advice" and fusion.get("association", "tight") != "tight":
-        yield "fusion.feedback: 'advice' steers the association filter, which only association = 'tight' has"
+    yield from _fusion_faults(_table(data, "fusion"))
+
+
+def _fusion_faults(fusion: Mapping[str, Any]) -> Iterator[str]:
+    mode, association, filter_ = (
+        fusion.get(key, default) for key, default in (("mode", "federated"), ("association", "tight"), ("filter", None))
+    )
+    feedback, terms = fusion.get("feedback", "none"), fusion.get("terms", 1)
+    mixture = association == "mirrored" or filter_ == "mht"
+    if feedback == "advice" and (association != "tight" or mixture):
+        yield (
+            "fusion.feedback: 'advice' steers the association filter of a single Gaussian, "
+            "which only association = 'tight' with another filter than 'mht' has"
+        )
+    if association == "mirrored" and filter_ not in (None, "mht"):
+        yield f"fusion.filter: {filter_!r} keeps one hypothesis; association = 'mirrored' needs 'mht', or no filter key"
+    if association != "mirrored" and isinstance(terms, int) and terms > 1:
+        yield f"fusion.terms: {terms} terms of a report need association = 'mirrored'"
+    if mode == "dkf" and (mixture or feedback == "reset"):
+        yield "fusion.mode: 'dkf' needs covariances that do not depend on data: no mixture, no feedback = 'reset'"
+    delay, window = fusion.get("feedback_delay", 0.0), fusion.get("window", 10.0)
+    if isinstance(delay, int | float) and isinstance(window, int | float) and delay > window:
+        yield f"fusion.feedback_delay: {delay} s is longer than the {window} s (fusion.window) that nodes keep scans"
 
 
 def _table(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:

@@ -129,8 +129,35 @@ class Stop(NamedTuple):
 
 
 class Advice(NamedTuple):
-    """Fused tracks for the association filters (theory.md §6), shapes (T,), (T, n), (T, n, n)."""
+    """Fused tracks for the association filters (theory.md §6).
 
+    Attributes:
+        given_ns: measurement time at which the center gives it.
+        time_ns: of the fused tracks.
+        ids: tracks, ascending, shape (T,).
+        x, P: fused densities, shapes (T, n), (T, n, n).
+    """
+
+    given_ns: int
+    time_ns: int
+    ids: IntArray
+    x: Array
+    P: Array
+
+
+class Rebase(NamedTuple):
+    """Fused tracks from which all factors begin anew (theory.md §3).
+
+    Attributes:
+        epoch: of the reports that descend from it.
+        given_ns: measurement time at which the center gives it.
+        time_ns: of the fused tracks.
+        ids: tracks, ascending, shape (T,).
+        x, P: fused densities, of which each factor takes its share, shapes (T, n), (T, n, n).
+    """
+
+    epoch: int
+    given_ns: int
     time_ns: int
     ids: IntArray
     x: Array
@@ -203,7 +230,7 @@ class Decision(NamedTuple):
     scans: int
 
 
-Message: TypeAlias = Report | Scan | Proposal | Join | Start | Stop | Advice | Clock | Tracks | Decision
+Message: TypeAlias = Report | Scan | Proposal | Join | Start | Stop | Advice | Rebase | Clock | Tracks | Decision
 
 
 class Keys(NamedTuple):
@@ -276,7 +303,7 @@ class Keys(NamedTuple):
                 return self.join(message.sensor)
             case Start() | Stop():
                 return self.command(message.sensor)
-            case Advice():
+            case Advice() | Rebase():
                 return self.advice()
             case Clock():
                 return self.clock()

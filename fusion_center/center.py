@@ -7,7 +7,7 @@ does not depend on the order of arrival.
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -15,9 +15,22 @@ import numpy as np
 
 from common.config import FusionConfig, Scenario
 from common.estimation.batch import take
-from common.estimation.gaussian import Gaussian
+from common.estimation.gaussian import Array, Gaussian, moments
 from common.estimation.sprt import DELETED
-from common.messages import NEVER, Advice, Clock, Decision, Join, Message, Report, Start, Stop, Tracks
+from common.messages import (
+    NEVER,
+    Advice,
+    Clock,
+    Decision,
+    IntArray,
+    Join,
+    Message,
+    Rebase,
+    Report,
+    Start,
+    Stop,
+    Tracks,
+)
 from common.quantities import NS_PER_S
 from fusion_center.picture import Expected, Fuser, Heard, Picture
 from fusion_center.state import Checkpoint, Counts, Event, Member, Presence, State, Waiting
@@ -153,15 +166,27 @@ class Center:
         number = self.names.index(join.sensor)
         member = state.members[number]
         epoch = member.epoch
+        lineage = member.lineage
         if not member.joined or join.incarnation != member.incarnation:
-            epoch = 1 + max(self.first_epoch, *(other.epoch for other in state.members))
-        member = Member(joined=True, alive=True, incarnation=join.incarnation, epoch=epoch, next_ns=join.next_ns)
+            epoch, lineage = self._next_epoch(state), state.lineage
+        member = Member(
+            joined=True,
+            alive=True,
+            incarnation=join.incarnation,
+            epoch=epoch,
+            next_ns=join.next_ns,
+            lineage=lineage,
+        )
         state = state.with_member(number, member)
         answer: list[Message] = [self._start(state.picture, number, epoch)]
         if state.clock is not None:
-            advice = self._advice(self.tracks(state)) if state.history else []
+            advice = self._advice(state) if state.history and self.fusion.feedback == "advice" else []
             answer += [*advice, state.clock]
         return state, answer
+
+    def _next_epoch(self, state: State) -> int:
+        told = [rebase.epoch for rebase in state.told]
+        return 1 + max(self.first_epoch, *(member.epoch for member in state.members), *told)
 
     def _start(self, picture: Picture, number: int, epoch: int) -> Start:
         """The live tracks for one sensor: its last factor where it reported one, else the prior.
@@ -171,8 +196,10 @@ class Center:
         live = picture.status != DELETED
         held = picture.reported[:, number]
         prior = self.fuser.share.start(Gaussian(picture.x0, picture.P0))
-        x = np.where(held[:, None], picture.x[:, number], prior.x)
-        P = np.where(held[:, None, None], picture.P[:, number], prior.P)
+        # Which of its hypotheses a node held for true it has not said: the terms' own weights must do.
+        last = moments(np.exp(picture.log_a[:, number]), Gaussian(picture.x[:, number], picture.P[:, number]))
+        x = np.where(held[:, None], last.x, prior.x)
+        P = np.where(held[:, None, None], last.P, prior.P)
         x_a = np.where(held[:, None], picture.fused_x, picture.x0)
         P_a = np.where(held[:, None, None], picture.fused_P, picture.P0)
         return Start(
@@ -192,11 +219,12 @@ class Center:
         if report.sensor not in self.names:
             return None
         member = state.members[self.names.index(report.sensor)]
-        if not member.joined or report.epoch != member.epoch or report.next_ns <= report.time_ns:
+        told = any(report.epoch == rebase.epoch > member.epoch for rebase in state.told)
+        if not member.joined or not (report.epoch == member.epoch or told) or report.next_ns <= report.time_ns:
             return None
         if self._ahead(state.clock, report.time_ns, now_ns):
             return None
-        if report.x.shape[-1] != self.fuser.motion.n or (report.terms != 1).any():
+        if report.x.shape[-1] != self.fuser.motion.n or (report.terms > self.fuser.terms).any():
             return None
         return _sound(report)
 
@@ -237,13 +265,36 @@ class Center:
         pictures: list[Message] = []
         for time_ns in sorted(groups):
             state = self._work_in(state, time_ns, groups[time_ns])
-            pictures += self._publish(state)
+            pictures += [self.tracks(state), *self._advice(state)]
         after = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
         return state, [*_corrections(before, after), *pictures]
 
     def _work_in(self, state: State, time_ns: int, reports: Mapping[int, Heard]) -> State:
-        picture, decisions = self.fuser.advance(self._expected(state, time_ns), reports)
-        return state._replace(history=(*state.history, Checkpoint(time_ns, reports, picture, tuple(decisions))))
+        lineages = {number: self._lineage(state, number, heard.report) for number, heard in reports.items()}
+        rebase = self._followed(state, max(lineages.values()))
+        if rebase is None:
+            lineage, expected = state.lineage, self._expected(state, time_ns)
+        else:
+            then = next(past.picture for past in state.history if past.time_ns == rebase.time_ns)
+            lineage = rebase.epoch
+            expected = self.fuser.expect(self.fuser.rebased(state.picture, then, rebase), time_ns)
+        # A node that has not followed yet speaks of factors that are no more.
+        heard = {number: report for number, report in reports.items() if lineages[number] == lineage}
+        picture, decisions = self.fuser.advance(expected, heard)
+        checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), lineage)
+        return state._replace(history=(*state.history, checkpoint))
+
+    def _lineage(self, state: State, number: int, report: Report) -> int:
+        """Epoch of the rebase that a report's factors descend from."""
+        followed = any(rebase.epoch == report.epoch for rebase in state.told)
+        return report.epoch if followed else state.members[number].lineage
+
+    def _followed(self, state: State, lineage: int) -> Rebase | None:
+        """The rebase of a lineage, if it is newer than that of the picture."""
+        if lineage <= state.lineage:
+            return None
+        times = {past.time_ns for past in state.history}
+        return next((told for told in state.told if told.epoch == lineage and told.time_ns in times), None)
 
     def _expected(self, state: State, time_ns: int) -> Expected:
         """The newest picture at a later time: as it was prepared, where that still holds."""
@@ -277,9 +328,10 @@ class Center:
                 break
             rest = {time: group for time, group in state.waiting.items() if time != time_ns}
             state = self._work_in(state._replace(waiting=rest), time_ns, waiting.reports)
-            messages += [*state.history[-1].decisions, *self._publish(state)]
+            messages += [*state.history[-1].decisions, self.tracks(state), *self._advice(state)]
+            state, rebase = self._rebase(state)
             state, stops = self._forget(state)
-            messages += stops
+            messages += [*rebase, *stops]
         return state, messages
 
     def _forget(self, state: State) -> tuple[State, list[Message]]:
@@ -290,7 +342,10 @@ class Center:
         gone, state = state.history[:keep], state._replace(history=state.history[keep:])
         if not gone:
             return state, []
-        state = state._replace(base=gone[-1].picture, base_ns=gone[-1].time_ns)
+        told = tuple(rebase for rebase in state.told if rebase.time_ns > gone[-1].time_ns)
+        state = state._replace(
+            base=gone[-1].picture, base_ns=gone[-1].time_ns, base_lineage=gone[-1].lineage, told=told
+        )
         deleted = [checkpoint.picture.ids[checkpoint.picture.status == DELETED] for checkpoint in gone]
         if not any(map(len, deleted)):
             return state, []
@@ -314,16 +369,26 @@ class Center:
         clock = state.clock._replace(time_ns=time_ns, clear_ns=clear_ns)
         return state._replace(clock=clock), [clock]
 
-    def _publish(self, state: State) -> list[Message]:
-        """The newest picture, and advice where it is wanted."""
-        tracks = self.tracks(state)
-        return [tracks, *self._advice(tracks)]
-
-    def _advice(self, tracks: Tracks) -> list[Message]:
-        if self.fusion.feedback == "none":
+    def _advice(self, state: State) -> list[Message]:
+        """The fused tracks for the association filters, where that is wanted (theory.md §6)."""
+        if self.fusion.feedback != "advice":
             return []
-        live = tracks.status != DELETED
-        return [Advice(tracks.time_ns, tracks.ids[live], tracks.x[live], tracks.P[live])]
+        return [Advice(state.time_ns, *self._given(state))]
+
+    def _rebase(self, state: State) -> tuple[State, list[Message]]:
+        """Let all factors begin anew from the fused tracks, where that is wanted (theory.md §3)."""
+        if self.fusion.feedback != "reset":
+            return state, []
+        rebase = Rebase(self._next_epoch(state), state.time_ns, *self._given(state))
+        return state._replace(told=(*state.told, rebase)), [rebase]
+
+    def _given(self, state: State) -> tuple[int, IntArray, Array, Array]:
+        """Time and fused live tracks that feedback is about: the newest that are as old as its delay."""
+        latest_ns = state.time_ns - round(self.fusion.feedback_delay * NS_PER_S)
+        at = bisect_right(state.history, latest_ns, key=lambda checkpoint: checkpoint.time_ns)
+        time_ns, picture = (state.history[at - 1].time_ns, state.history[at - 1].picture) if at else (0, state.base)
+        live = (picture.starts_ns <= time_ns) & (picture.status != DELETED)
+        return time_ns, picture.ids[live], picture.fused_x[live], picture.fused_P[live]
 
     def tracks(self, state: State) -> Tracks:
         """The newest picture as a message: all tracks that have started."""

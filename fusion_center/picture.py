@@ -10,13 +10,14 @@ import numpy as np
 
 from common.config import Scenario
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, multiply, whitener
+from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, log_sum_exp, whitener
+from common.estimation.mixture_product import multiply_mixtures
 from common.estimation.motion import Motion
 from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import DELETED, TENTATIVE, StatusArray, Thresholds, decide
-from common.messages import Decision, IntArray, Report
+from common.messages import Decision, IntArray, Rebase, Report
 from common.quantities import NS_PER_S
 
 
@@ -32,12 +33,13 @@ class Picture(NamedTuple):
         scans: measurement times used, shape (T,).
         log_lr: since the last reset, shape (T,).
         log_lr_total: since the start, shape (T,).
-        log_p_bar: cumulative, as last reported, shape (T, S).
+        log_p_bar: cumulative, as last reported, of all terms of a factor, shape (T, S).
+        log_a: relative weights of the terms, shape (T, S, K); -inf is no term.
         reported: which sensors ever reported the track, shape (T, S).
         contributing: which sensors reported it at the newest time, shape (T, S).
-        x, P: factors, shapes (T, S, n), (T, S, n, n).
+        x, P: terms of the factors, shapes (T, S, K, n), (T, S, K, n, n).
         fused_x, fused_P: the product (Eq. 9), shapes (T, n), (T, n, n).
-        network_P: for ``dkf``, the covariances that follow from the models alone, like P; otherwise S = 0.
+        network_P: for ``dkf``, the covariances that follow from the models alone, shape (T, S, n, n); otherwise S = 0.
     """
 
     ids: IntArray
@@ -50,6 +52,7 @@ class Picture(NamedTuple):
     log_lr: Array
     log_lr_total: Array
     log_p_bar: Array
+    log_a: Array
     reported: BoolArray
     contributing: BoolArray
     x: Array
@@ -64,10 +67,16 @@ class Heard(NamedTuple):
 
     Attributes:
         report: as it came.
-        factors: of the report.
+        log_p_bar: of all terms of a track, shape (T,).
+        log_a: relative weights of the terms, shape (T, K).
+        P: of the terms, shape (T, K, n, n).
+        factors: the terms, shapes (T, K, n), (T, K, n, n), (T, K).
     """
 
     report: Report
+    log_p_bar: Array
+    log_a: Array
+    P: Array
     factors: Whitened
 
     @classmethod
@@ -77,7 +86,21 @@ class Heard(NamedTuple):
         Raises:
             numpy.linalg.LinAlgError: when a covariance is not positive definite.
         """
-        return cls(report, Whitened(report.x, *whitener(report.P)))
+        factors = Whitened(report.x, *whitener(report.P))
+        if len(report.log_g) == len(report.ids):  # one term each
+            log_a = np.zeros((len(report.ids), 1))
+            return cls(report, report.log_g, log_a, report.P[:, None], Whitened(*(part[:, None] for part in factors)))
+        # Where a track has fewer terms than others its first one stands there with no weight.
+        size = int(report.terms.max(initial=1))
+        there = np.arange(size) < report.terms[:, None]
+        first = np.cumsum(report.terms) - report.terms
+        which = np.where(there, first[:, None] + np.arange(size), first[:, None])
+        log_g = np.where(there, report.log_g[which], -np.inf)
+        log_p_bar = log_sum_exp(log_g)
+        possible = (log_p_bar > -np.inf)[:, None]
+        log_a = np.where(possible, log_g, np.where(there, 0.0, -np.inf)) - np.where(possible, log_p_bar[:, None], 0.0)
+        log_a -= log_sum_exp(log_a)[:, None]
+        return cls(report, log_p_bar, log_a, report.P[which], Whitened(*(part[which] for part in factors)))
 
 
 class Expected(NamedTuple):
@@ -112,12 +135,14 @@ class Reported(NamedTuple):
     Attributes:
         who: which sensors reported which track, shape (T, S).
         log_p_bar: cumulative, shape (T, S); where nothing was reported, the last one.
-        P: of the factors, shape (T, S, n, n); where nothing was reported, of the predicted ones.
+        log_a: relative weights of the terms, shape (T, S, K); where nothing was reported, the last ones.
+        P: of the factors, shape (T, S, K, n, n); where nothing was reported, of the predicted ones.
         factors: the same, taken apart.
     """
 
     who: BoolArray
     log_p_bar: Array
+    log_a: Array
     P: Array
     factors: Whitened
 
@@ -130,6 +155,7 @@ class Fuser:
         motion: motion model.
         sensors: models of the sensors, in the order of the scenario.
         share: a sensor's share of prior and process noise.
+        terms: most terms of a factor.
         limits: thresholds of the test, or None: nothing is decided.
         globalised: predict as ``dkf`` does.
     """
@@ -137,6 +163,7 @@ class Fuser:
     motion: Motion
     sensors: tuple[Sensor, ...]
     share: Share
+    terms: int
     limits: Thresholds | None
     globalised: bool
 
@@ -148,6 +175,7 @@ class Fuser:
             motion=motion,
             sensors=tuple(sensor.build(motion) for sensor in scenario.sensors),
             share=scenario.share,
+            terms=scenario.fusion.terms,
             limits=scenario.decision.thresholds if scenario.decision.enabled else None,
             globalised=scenario.fusion.mode == "dkf",
         )
@@ -168,10 +196,11 @@ class Fuser:
             log_lr=floats,
             log_lr_total=floats,
             log_p_bar=per_sensor,
+            log_a=np.empty((0, n_sensors, self.terms)),
             reported=per_sensor.astype(np.bool_),
             contributing=per_sensor.astype(np.bool_),
-            x=np.empty((0, n_sensors, n)),
-            P=np.empty((0, n_sensors, n, n)),
+            x=np.empty((0, n_sensors, self.terms, n)),
+            P=np.empty((0, n_sensors, self.terms, n, n)),
             fused_x=np.empty((0, n)),
             fused_P=np.empty((0, n, n)),
             network_P=np.empty((0, n_sensors if self.globalised else 0, n, n)),
@@ -180,8 +209,7 @@ class Fuser:
     def begin(self, picture: Picture, ids: IntArray, times_ns: IntArray, priors: Gaussian) -> Picture:
         """Add tracks that start with ``priors``, shapes (T, n), (T, n, n)."""
         tracks, n_sensors = len(ids), len(self.sensors)
-        factor = self.share.start(priors)
-        P = np.repeat(factor.P[:, None], n_sensors, axis=1)
+        log_a, (x, P) = self._shares(priors)
         new = Picture(
             ids=ids,
             starts_ns=times_ns,
@@ -193,16 +221,57 @@ class Fuser:
             log_lr=np.zeros(tracks),
             log_lr_total=np.zeros(tracks),
             log_p_bar=np.zeros((tracks, n_sensors)),
+            log_a=log_a,
             reported=np.zeros((tracks, n_sensors), np.bool_),
             contributing=np.zeros((tracks, n_sensors), np.bool_),
-            x=np.repeat(factor.x[:, None], n_sensors, axis=1),
+            x=x,
             P=P,
             fused_x=priors.x,
             fused_P=priors.P,
-            network_P=P if self.globalised else P[:, :0],
+            network_P=P[:, :, 0] if self.globalised else P[:, :0, 0],
         )
         both = concatenate(picture, new)
         return take(both, np.argsort(both.ids))
+
+    def rebased(self, now: Picture, then: Picture, told: Rebase) -> Picture:
+        """The newest picture with factors that begin anew from what the nodes were told (theory.md §3).
+
+        The density and LR at that time stay what they were; what was reported since comes again, with the new factors.
+
+        Args:
+            now: the newest picture.
+            then: the picture at the time of the rebase.
+            told: the fused tracks.
+
+        Returns:
+            the picture, its rebased tracks at the time of the rebase.
+        """
+        rows, given = _common(now.ids, told.ids)
+        old, _ = _common(then.ids, now.ids[rows])
+        assert len(then.ids[old]) == len(now.ids[rows]), "a track that was told of was there"
+        log_a, (x, P) = self._shares(Gaussian(told.x[given], told.P[given]))
+        part = take(now, rows) if not isinstance(rows, slice) else now
+        gained = then.log_lr_total[old] - part.log_lr_total
+        part = part._replace(
+            times_ns=np.full_like(part.times_ns, told.time_ns),
+            log_lr=part.log_lr + gained,
+            log_lr_total=part.log_lr_total + gained,
+            log_p_bar=np.zeros_like(part.log_p_bar),
+            log_a=log_a,
+            x=x,
+            P=P,
+            fused_x=told.x[given],
+            fused_P=told.P[given],
+        )
+        return part if isinstance(rows, slice) else put(now, rows, part)
+
+    def _shares(self, densities: Gaussian) -> tuple[Array, Gaussian]:
+        """Weights and densities of the terms of all factors whose product is given, shapes (T, S, K), ... ."""
+        n_sensors, factor = len(self.sensors), self.share.start(densities)
+        log_a = np.full((len(factor.x), n_sensors, self.terms), -np.inf)
+        log_a[:, :, 0] = 0.0
+        x, P = (np.repeat(np.repeat(part[:, None, None], n_sensors, axis=1), self.terms, axis=2) for part in factor)
+        return log_a, Gaussian(x, P)
 
     def expect(self, picture: Picture, t_ns: int) -> Expected:
         """Work out what a picture will be at a measurement time, as far as no report is needed for it."""
@@ -211,7 +280,8 @@ class Fuser:
         moving = take(kept, live)
         factors, network_P = self._predict(moving, t_ns)
         whitened = Whitened(factors.x, *whitener(factors.P))
-        return Expected(picture, t_ns, kept, live, moving, factors, whitened, multiply(whitened), network_P)
+        product = multiply_mixtures(moving.log_a, whitened)
+        return Expected(picture, t_ns, kept, live, moving, factors, whitened, product, network_P)
 
     def advance(self, expected: Expected, reports: Mapping[int, Heard]) -> tuple[Picture, list[Decision]]:
         """Work in all reports of one measurement time.
@@ -233,7 +303,7 @@ class Fuser:
         picture, before = expected.moving, expected.product
         said = _collect(expected, reports)
         heard = said.who.any(axis=-1)
-        after = multiply(said.factors) if heard.any() else before
+        after = multiply_mixtures(said.log_a, said.factors) if heard.any() else before
         # Cumulative sums that are both -inf have not changed.
         same = said.log_p_bar == picture.log_p_bar
         evidence = np.where(same, 0.0, said.log_p_bar) - np.where(same, 0.0, picture.log_p_bar)
@@ -246,6 +316,7 @@ class Fuser:
             log_lr=picture.log_lr + step,
             log_lr_total=picture.log_lr_total + step,
             log_p_bar=said.log_p_bar,
+            log_a=said.log_a,
             reported=picture.reported | said.who,
             contributing=said.who,
             x=said.factors.x,
@@ -258,14 +329,15 @@ class Fuser:
     def _predict(self, picture: Picture, t_ns: int) -> tuple[Gaussian, Array]:
         """Predict all factors as their nodes do (Eq. 5; ``dkf``: with one covariance for all)."""
         dt: Array = (t_ns - picture.times_ns) / NS_PER_S
-        dt = dt[0, ...] if len(dt) and (dt == dt[0]).all() else dt[:, None]
+        dt = dt[0, ...] if len(dt) and (dt == dt[0]).all() else dt[:, None, None]
         factors = Gaussian(picture.x, picture.P)
         if not self.globalised:
             return self.share.predict(factors, self.motion, dt), picture.network_P
         common = globalise(picture.network_P)
-        P = np.repeat(common.P[:, None], len(self.sensors), axis=1)
-        predicted = self.share.predict(Gaussian(np.matvec(common.G, factors.x), P), self.motion, dt)
-        return predicted, predicted.P
+        P = np.repeat(common.P[:, None, None], len(self.sensors), axis=1)
+        x = np.matvec(common.G, factors.x[:, :, 0])[:, :, None]
+        predicted = self.share.predict(Gaussian(x, P), self.motion, dt)
+        return predicted, predicted.P[:, :, 0]
 
     def _shrunk(self, network_P: Array, reports: Mapping[int, Heard]) -> Array:
         network_P = network_P.copy()
@@ -299,16 +371,18 @@ class Fuser:
 def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
     """Lay the reports over the predicted factors; tracks that a report or the picture lacks are left alone."""
     picture = expected.moving
-    who, log_p_bar = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy()
+    who, log_p_bar, log_a = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy(), picture.log_a.copy()
     P, factors = expected.factors.P.copy(), Whitened(*(array.copy() for array in expected.whitened))
-    for number, (report, theirs) in reports.items():
-        rows, others = _common(picture.ids, report.ids)
+    for number, heard in reports.items():
+        rows, others = _common(picture.ids, heard.report.ids)
         who[rows, number] = True
-        log_p_bar[rows, number] = report.log_g[others]
-        P[rows, number] = report.P[others]
-        for array, new in zip(factors, theirs, strict=True):
-            array[rows, number] = new[others]
-    return Reported(who, log_p_bar, P, factors)
+        log_p_bar[rows, number] = heard.log_p_bar[others]
+        size = heard.log_a.shape[1]
+        log_a[rows, number, :size], log_a[rows, number, size:] = heard.log_a[others], -np.inf
+        P[rows, number, :size] = heard.P[others]
+        for array, new in zip(factors, heard.factors, strict=True):
+            array[rows, number, :size] = new[others]
+    return Reported(who, log_p_bar, log_a, P, factors)
 
 
 def _common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:

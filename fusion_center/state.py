@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple, TypeAlias
 
-from common.messages import NEVER, Clock, Decision, Join, Report
+from common.messages import NEVER, Clock, Decision, Join, Rebase, Report
 from fusion_center.picture import Expected, Heard, Picture
 
 
@@ -32,6 +32,7 @@ class Member(NamedTuple):
         incarnation: of its process.
         epoch: its reports must carry.
         next_ns: nothing earlier will come from it.
+        lineage: of its factors, before it follows a rebase.
     """
 
     joined: bool = False
@@ -39,15 +40,25 @@ class Member(NamedTuple):
     incarnation: int = 0
     epoch: int = 0
     next_ns: int = 0
+    lineage: int = 0
 
 
 class Checkpoint(NamedTuple):
-    """One measurement time, worked in."""
+    """One measurement time, worked in.
+
+    Attributes:
+        time_ns: the measurement time.
+        reports: by number of the sensor.
+        picture: after them.
+        decisions: made then.
+        lineage: epoch of the rebase that the factors of the picture descend from; 0: none.
+    """
 
     time_ns: int
     reports: Mapping[int, Heard]
     picture: Picture
     decisions: tuple[Decision, ...]
+    lineage: int = 0
 
 
 class Waiting(NamedTuple):
@@ -88,8 +99,10 @@ class State(NamedTuple):
         waiting: by measurement time.
         base: the picture before the oldest checkpoint.
         base_ns: its time.
+        base_lineage: its lineage.
         history: checkpoints inside the window, oldest first.
         counts: of reports.
+        told: the rebases that the nodes were told of, oldest first, as far back as the history goes.
         expected: worked out ahead for the next measurement time, or None. It saves time and changes nothing.
     """
 
@@ -101,12 +114,19 @@ class State(NamedTuple):
     base_ns: int
     history: tuple[Checkpoint, ...]
     counts: Counts
+    base_lineage: int = 0
+    told: tuple[Rebase, ...] = ()
     expected: Expected | None = None
 
     @property
     def picture(self) -> Picture:
         """The newest picture."""
         return self.history[-1].picture if self.history else self.base
+
+    @property
+    def lineage(self) -> int:
+        """Epoch of the rebase that the newest factors descend from."""
+        return self.history[-1].lineage if self.history else self.base_lineage
 
     @property
     def time_ns(self) -> int:

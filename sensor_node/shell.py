@@ -15,7 +15,7 @@ from common.errors import ConfigError, DecodeError, TransportError, VersionError
 from common.health import Health, age_s
 from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
-from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Scan, Start, Stop
+from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Rebase, Scan, Start, Stop
 from common.transport import Bus, Publisher
 from sensor_node.tracker import LocalTracker
 
@@ -188,10 +188,10 @@ class NodeShell:
             self.complaints.add("bad bytes", str(error))
             return
         match message:
-            case Start() | Advice() if message.x.shape[-1] != self._tracker.motion.n:
+            case Start() | Advice() | Rebase() if message.x.shape[-1] != self._tracker.filter.motion.n:
                 raise ConfigError(
-                    f"{key}: states of {message.x.shape[-1]} numbers, this node's have {self._tracker.motion.n}: "
-                    "do center and node run the same scenario?"
+                    f"{key}: states of {message.x.shape[-1]} numbers, "
+                    f"this node's have {self._tracker.filter.motion.n}: do center and node run the same scenario?"
                 )
             case Start():
                 self._answered = True
@@ -201,7 +201,10 @@ class NodeShell:
                 self._state = self._tracker.stop(self._state, message)
             case Advice():
                 self._state = self._tracker.advise(self._state, message)
-                self._advised_ns = max(message.time_ns, self._advised_ns or message.time_ns)
+                self._advised_ns = max(message.given_ns, self._advised_ns or message.given_ns)
+            case Rebase():
+                self._state = self._tracker.rebase(self._state, message)
+                self._advised_ns = max(message.given_ns, self._advised_ns or message.given_ns)
             case Clock():
                 self._set_clock(message)
             case _:
@@ -210,7 +213,7 @@ class NodeShell:
     def _set_clock(self, clock: Clock) -> None:
         first = self._clock is None
         self._clock = clock
-        if self._tracker.advised and self._new_center:
+        if self._tracker.feedback and self._new_center:
             self._advised_ns = clock.time_ns
         self._new_center = False
         if not first:
@@ -242,7 +245,7 @@ class NodeShell:
         """Prepare the next scan if it is near; returns when there is something to do next."""
         if self._clock is None or not self._answered or self._exhausted:
             return due_ns
-        if due_ns is None and self._tracker.advised:  # what is to come would undo it
+        if due_ns is None and self._tracker.feedback:  # what is to come would undo it
             return None
         if due_ns is not None and due_ns - time.time_ns() > _AHEAD_NS:
             return due_ns - _AHEAD_NS

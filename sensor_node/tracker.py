@@ -14,27 +14,26 @@ from typing import NamedTuple
 import numpy as np
 
 from common.config import Scenario, SensorConfig
-from common.estimation.association import Clutter, Expected, Plots, expect, pdaf, update
+from common.estimation.association import Expected, Plots
 from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, BoolArray, Gaussian
-from common.estimation.motion import Motion
-from common.estimation.representation import Share, globalise, shrink
+from common.estimation.mixture import Mixture
+from common.estimation.representation import globalise, shrink
 from common.estimation.sensing import Sensor
-from common.messages import Advice, IntArray, Report, Scan, Start, Stop
+from common.messages import Advice, IntArray, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
-
-#: The honest prior and noise of the association filter.
-HONEST = Share(1.0)
+from sensor_node.local_filter import LocalFilter
 
 
 class Tracks(NamedTuple):
-    """What a node keeps of every track, one row a track.
+    """What a node keeps of every track, one row a track; a single Gaussian is a mixture of one component.
 
     Attributes:
         ids: ascending, shape (T,).
         times_ns: of the factors, shape (T,).
-        log_p_bar: cumulative since the start, shape (T,).
-        x, P: factors, shapes (T, n), (T, n, n).
+        log_w: honest weights of the components, sum one, shape (T, C); -inf is no component.
+        log_g: log evidence of the components since the start, with one of them log p_bar, shape (T, C).
+        x, P: factors, shapes (T, C, n), (T, C, n, n).
         times_a_ns: of the association filters, shape (T,).
         x_a, P_a: association filters.
         network_P: for ``dkf``, the covariances that all sensors' factors have by the models alone, shape
@@ -43,7 +42,8 @@ class Tracks(NamedTuple):
 
     ids: IntArray
     times_ns: IntArray
-    log_p_bar: Array
+    log_w: Array
+    log_g: Array
     x: Array
     P: Array
     times_a_ns: IntArray
@@ -61,6 +61,7 @@ class Ready(NamedTuple):
         advised: all tracks, advice followed.
         live: which of them started before the scan.
         predicted: those, at the time of the scan.
+        mixture: the same, as the filter has them.
         expected: those, as the sensor will see them.
     """
 
@@ -71,12 +72,27 @@ class Ready(NamedTuple):
     advised: Tracks
     live: BoolArray
     predicted: Tracks
+    mixture: Mixture
     expected: Expected
 
     def fits(self, state: State, time_ns: int, position: Array) -> bool:
         """Whether it was worked out from the tracks and advice of a state, for the scan of that time and position."""
         same_state = self.tracks is state.tracks and self.advice is state.advice
         return same_state and self.time_ns == time_ns and np.array_equal(self.position, position)
+
+
+class Look(NamedTuple):
+    """A scan as the tracker keeps it.
+
+    Attributes:
+        time_ns: of the scan.
+        position: where the sensor stood [m], shape (d,).
+        plots: that all tracks share; in a study, where all tracks start together, of every track its own.
+    """
+
+    time_ns: int
+    position: Array
+    plots: Plots
 
 
 class State(NamedTuple):
@@ -94,7 +110,7 @@ class State(NamedTuple):
     epoch: int
     sequence: int
     tracks: Tracks
-    recent: tuple[Scan, ...]
+    recent: tuple[Look, ...]
     advice: tuple[Advice, ...] = ()
     ready: Ready | None = None
 
@@ -116,32 +132,26 @@ class LocalTracker:
     """The steps of one sensor's tracker.
 
     Attributes:
-        motion: motion model.
         config: the sensor as the scenario describes it.
         sensor: the sensor model.
         sensors: models of all sensors of the network.
         number: of this sensor among them.
-        share: its share of prior and process noise.
-        tight: associate with a filter of its own (theory.md §5).
-        advised: the fused track comes back as advice (theory.md §6).
+        filter: predicts and filters the tracks.
+        feedback: the fused track comes back, as advice or to begin anew (theory.md §3, 6).
         rounded: reports are in single precision.
         digest: of what the center must have in common with this node.
-        gate_probability: that the target's plot is inside the gate.
         buffer_ns: how long scans are kept.
         schedule: scan times of the network, only for ``dkf``.
     """
 
-    motion: Motion
     config: SensorConfig
     sensor: Sensor
     sensors: tuple[Sensor, ...]
     number: int
-    share: Share
-    tight: bool
-    advised: bool
+    filter: LocalFilter
+    feedback: bool
     rounded: bool
     digest: str
-    gate_probability: float
     buffer_ns: int
     schedule: Schedule | None
 
@@ -160,27 +170,25 @@ class LocalTracker:
         sensors = tuple(sensor.build(motion) for sensor in scenario.sensors)
         number = scenario.sensor_names.index(name)
         return cls(
-            motion=motion,
             config=config,
             sensor=sensors[number],
             sensors=sensors,
             number=number,
-            share=scenario.share,
-            tight=scenario.fusion.association == "tight",
-            advised=scenario.fusion.feedback == "advice",
+            filter=LocalFilter.of(scenario),
+            feedback=scenario.fusion.feedback != "none",
             rounded=scenario.fusion.precision == "float32",
             digest=scenario.digest,
-            gate_probability=scenario.fusion.gate_probability,
             buffer_ns=round(scenario.fusion.window * NS_PER_S),
             schedule=schedule if scenario.fusion.mode == "dkf" else None,
         )
 
     def initial(self) -> State:
         """A node that was told of no track yet."""
-        n = self.motion.n
+        n = self.filter.motion.n
         network = len(self.sensors) if self.schedule else 0
-        none, x, P = np.empty(0, np.int64), np.empty((0, n)), np.empty((0, n, n))
-        tracks = Tracks(none, none, np.empty(0), x, P, none, x, P, np.empty((0, network, n, n)))
+        none, numbers = np.empty(0, np.int64), np.empty((0, 1))
+        x, P = np.empty((0, 1, n)), np.empty((0, 1, n, n))
+        tracks = Tracks(none, none, numbers, numbers, x, P, none, x, P, np.empty((0, network, n, n)))
         return State(epoch=0, sequence=0, tracks=tracks, recent=())
 
     def prepare(self, state: State, time_ns: int, position: Array) -> State:
@@ -189,40 +197,67 @@ class LocalTracker:
 
     def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report]:
         """Filter one scan and report every track that started before it."""
-        ready = self._ready(state, scan.time_ns, scan.position)
-        filtered = self._update(ready.predicted, ready.expected, scan)
-        tracks = filtered if ready.live.all() else put(ready.advised, ready.live, filtered)
-        advice = tuple(later for later in state.advice if later.time_ns >= scan.time_ns)
-        kept = tuple(old for old in state.recent if old.time_ns >= scan.time_ns - self.buffer_ns)
-        x, P = filtered.x, filtered.P
+        return self.look(state, Look(scan.time_ns, scan.position, Plots(scan.z)), next_ns)
+
+    def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report]:
+        """``scan``, for plots that may be of every track its own."""
+        ready = self._ready(state, look.time_ns, look.position)
+        mixture = self.filter.update(ready.mixture, ready.expected, look.plots)
+        filtered = self._with(ready.predicted, mixture)
+        tracks = filtered if ready.live.all() else _put(ready.advised, ready.live, filtered)
+        advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
+        kept = tuple(old for old in state.recent if old.time_ns >= look.time_ns - self.buffer_ns)
+        report = self._report(state, look.time_ns, next_ns, filtered.ids, self.filter.report(mixture))
+        return State(state.epoch, state.sequence + 1, tracks, (*kept, look), advice), report
+
+    def _report(self, state: State, time_ns: int, next_ns: int, ids: IntArray, mixture: Mixture) -> Report:
+        there = mixture.log_w > -np.inf
+        x, P = (array[0][there] for array in mixture.density)
         if self.rounded:
             x, P = x.astype(np.float32).astype(np.float64), P.astype(np.float32).astype(np.float64)
-        report = Report(
+        return Report(
             sensor=self.config.name,
             sequence=state.sequence,
-            time_ns=scan.time_ns,
+            time_ns=time_ns,
             next_ns=next_ns,
             epoch=state.epoch,
-            ids=filtered.ids,
-            terms=np.ones_like(filtered.ids),
-            log_g=filtered.log_p_bar,
+            ids=ids,
+            terms=there.sum(axis=-1),
+            log_g=mixture.log_g[there],
             x=x,
             P=P,
         )
-        return State(state.epoch, state.sequence + 1, tracks, (*kept, scan), advice), report
 
     def start(self, state: State, start: Start) -> State:
         """Take over tracks, and catch up on the scans since their start; a higher epoch names all tracks there are."""
         if start.epoch > state.epoch:
             state = state._replace(tracks=self.initial().tracks)
-        known = np.isin(start.ids, state.tracks.ids)
-        fresh = self._fresh(start, ~known)
-        for scan in state.recent:
-            due = fresh.times_ns < scan.time_ns
-            fresh = put(fresh, due, self._filter(take(fresh, due), scan))
-        tracks = concatenate(state.tracks, fresh)
+        fresh = take(self._fresh(start), ~np.isin(start.ids, state.tracks.ids))
+        return self._taken_over(state, start.epoch, fresh)
+
+    def rebase(self, state: State, rebase: Rebase) -> State:
+        """Begin anew from the fused tracks, and catch up on the scans since (theory.md §3)."""
+        if rebase.epoch <= state.epoch:
+            return state
+        mine = state.tracks
+        factor = self.filter.share.start(Gaussian(rebase.x, rebase.P))
+        times_ns, zero = np.full(len(rebase.ids), rebase.time_ns), np.zeros(len(rebase.ids))
+        start = Start("", rebase.epoch, rebase.ids, times_ns, zero, *factor, rebase.x, rebase.P)
+        fresh = take(self._fresh(start), np.isin(rebase.ids, mine.ids))
+        others = take(mine, ~np.isin(mine.ids, rebase.ids))
+        return self._taken_over(state._replace(tracks=others), rebase.epoch, fresh)
+
+    def _taken_over(self, state: State, epoch: int, fresh: Tracks) -> State:
+        """The state with new tracks, which have seen the scans that are kept."""
+        for look in state.recent:
+            due = fresh.times_ns < look.time_ns
+            if due.any():
+                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position)
+                filtered = self._with(predicted, self.filter.update(mixture, expected, look.plots))
+                fresh = _put(fresh, due, filtered)
+        tracks = concatenate(*_alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
-        return state._replace(epoch=max(state.epoch, start.epoch), tracks=tracks)
+        return state._replace(epoch=max(state.epoch, epoch), tracks=tracks)
 
     def stop(self, state: State, stop: Stop) -> State:
         """Forget tracks."""
@@ -239,8 +274,8 @@ class LocalTracker:
             return ready
         advised = self._follow_advice(state, time_ns)
         live = advised.times_ns < time_ns
-        predicted, expected = self._expect(take(advised, live), time_ns, position)
-        return Ready(state.tracks, state.advice, time_ns, position, advised, live, predicted, expected)
+        moving = self._expect(take(advised, live), time_ns, position)
+        return Ready(state.tracks, state.advice, time_ns, position, advised, live, *moving)
 
     def _follow_advice(self, state: State, t_ns: int) -> Tracks:
         """Set the association filters to the newest fused tracks from before ``t_ns`` and redo the scans since.
@@ -254,88 +289,115 @@ class LocalTracker:
         tracks = state.tracks
         _, mine, given = np.intersect1d(tracks.ids, advice.ids, assume_unique=True, return_indices=True)
         x_a, P_a, times = tracks.x_a.copy(), tracks.P_a.copy(), tracks.times_a_ns.copy()
-        x_a[mine], P_a[mine], times[mine] = advice.x[given], advice.P[given], advice.time_ns
-        for scan in state.recent:
-            due = times < scan.time_ns
+        x_a[mine, 0], P_a[mine, 0], times[mine] = advice.x[given], advice.P[given], advice.time_ns
+        for look in state.recent:
+            due = times < look.time_ns
             if due.any():
-                predicted = HONEST.predict(
-                    Gaussian(x_a[due], P_a[due]), self.motion, _interval(times[due], scan.time_ns)
-                )
-                linear = self.sensor.measurement.linearise(predicted, scan.position)
-                filtered = pdaf(predicted, Plots(scan.z), linear, self._clutter(predicted, scan.position))
-                (x_a[due], P_a[due]), times[due] = filtered.density, scan.time_ns
+                honest = self.filter.honest.start(Gaussian(x_a[due, 0], P_a[due, 0]))
+                predicted = self.filter.honest.predict(honest, _interval(times[due], look.time_ns))
+                expected = self._seen(self.filter.honest, predicted, look.position)
+                (x, P), times[due] = self.filter.honest.update(predicted, expected, look.plots).density, look.time_ns
+                x_a[due], P_a[due] = x[0], P[0]
         return tracks._replace(x_a=x_a, P_a=P_a, times_a_ns=times)
 
-    def _fresh(self, start: Start, rows: np.ndarray[tuple[int], np.dtype[np.bool_]]) -> Tracks:
+    def _fresh(self, start: Start) -> Tracks:
+        """Tracks as they are told of."""
         network = len(self.sensors) if self.schedule else 0
-        network_P = np.repeat(start.P[:, None], network, axis=1)
-        tracks = Tracks(
+        zero = np.zeros((len(start.ids), 1))
+        return Tracks(
             start.ids,
             start.times_ns,
-            start.log_p_bar,
-            start.x,
-            start.P,
+            zero,
+            zero + start.log_p_bar[:, None],
+            start.x[:, None],
+            start.P[:, None],
             start.times_ns,
-            start.x_a,
-            start.P_a,
-            network_P,
+            start.x_a[:, None],
+            start.P_a[:, None],
+            np.repeat(start.P[:, None], network, axis=1),
         )
-        return take(tracks, rows)
 
-    def _filter(self, tracks: Tracks, scan: Scan) -> Tracks:
-        """Predict to the scan and filter it."""
-        return self._update(*self._expect(tracks, scan.time_ns, scan.position), scan)
-
-    def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Expected]:
+    def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Mixture, Expected]:
         """Predict to a time, and what the sensor will see from a position then."""
+        mixture, network_P = self._predict(tracks, time_ns)
         now = np.full_like(tracks.times_ns, time_ns)
-        factor, network_P = self._predict_factors(tracks, time_ns)
-        filters, association = [factor], Gaussian(tracks.x_a, tracks.P_a)
-        if self.tight:
-            association = HONEST.predict(association, self.motion, _interval(tracks.times_a_ns, time_ns))
-            filters.append(association)
-        both = Gaussian(*(np.stack(arrays) for arrays in zip(*filters, strict=True)))
-        linear = self.sensor.measurement.linearise(both, position)
-        predicted = Tracks(tracks.ids, now, tracks.log_p_bar, *factor, now, *association, network_P)
-        return predicted, expect(both, linear, self._clutter(filters[-1], position))
+        predicted = self._with(tracks._replace(times_ns=now, times_a_ns=now, network_P=network_P), mixture)
+        return predicted, mixture, self._seen(self.filter, mixture, position)
 
-    def _update(self, predicted: Tracks, expected: Expected, scan: Scan) -> Tracks:
-        """Filter a scan."""
-        (x, P), log_p_bar = update(expected, Plots(scan.z))
-        tracks = predicted._replace(log_p_bar=predicted.log_p_bar + log_p_bar, x=x[0], P=P[0])
-        return tracks._replace(x_a=x[1], P_a=P[1]) if self.tight else tracks
+    def _seen(self, local: LocalFilter, predicted: Mixture, position: Array) -> Expected:
+        return local.expect(predicted.density, self.sensor, position, self.config.view_center(position))
 
-    def _clutter(self, density: Gaussian, position: Array) -> Clutter:
-        p_d = self.sensor.detection_probability(density, position, self.config.view_center(position))
-        return Clutter(p_d, np.array(self.sensor.log_rho_f), self.gate_probability)
-
-    def _predict_factors(self, tracks: Tracks, t_ns: int) -> tuple[Gaussian, Array]:
-        factor = Gaussian(tracks.x, tracks.P)
+    def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
+        mixture = self._mixture(tracks)
+        intervals = [_interval(times_ns, t_ns) for times_ns in (tracks.times_ns, tracks.times_a_ns)]
         if self.schedule is None:
-            return self.share.predict(factor, self.motion, _interval(tracks.times_ns, t_ns)), tracks.network_P
-        return self._predict_globalised(tracks, self.schedule, t_ns)
+            return self.filter.predict(mixture, *intervals), tracks.network_P
+        (x, P), network_P = self._predict_globalised(tracks, self.schedule, t_ns)
+        mixture = self.filter.predict(mixture, np.array(0.0), *intervals[1:])
+        mixture.density.x[0, :, 0], mixture.density.P[0, :, 0] = x, P
+        return mixture, network_P
 
     def _predict_globalised(self, tracks: Tracks, schedule: Schedule, t_ns: int) -> tuple[Gaussian, Array]:
         """Predict as ``dkf`` does: at every scan of any sensor, make all covariances equal before the prediction.
 
         What the other sensors' covariances are follows from the models and the schedule, never from data.
         """
-        x, P, network_P, times = tracks.x.copy(), tracks.P.copy(), tracks.network_P.copy(), tracks.times_ns.copy()
+        x, P, network_P, times = tracks.x[:, 0].copy(), tracks.P[:, 0].copy(), tracks.network_P.copy(), tracks.times_ns
         first = bisect_right(schedule.times_ns, int(times.min(initial=t_ns)))
         last = bisect_right(schedule.times_ns, t_ns)
+        share, motion = self.filter.share, self.filter.motion
         for event_ns, scanning in zip(schedule.times_ns[first:last], schedule.sensors[first:last], strict=True):
             due = times < event_ns
             common = globalise(network_P[due])
             x_own = np.matvec(common.G[:, self.number], x[due])
-            x[due], P[due] = self.share.predict(Gaussian(x_own, common.P), self.motion, _interval(times[due], event_ns))
+            x[due], P[due] = share.predict(Gaussian(x_own, common.P), motion, _interval(times[due], event_ns))
             network_P[due] = P[due][:, None]
             for number in scanning:
                 linear = self.sensors[number].measurement.linearise(
-                    Gaussian(x[due], P[due]), np.zeros(self.motion.dimensions)
+                    Gaussian(x[due], P[due]), np.zeros(self.filter.motion.dimensions)
                 )
                 network_P[due, number] = shrink(P[due], linear.H, linear.R)
-            times[due] = event_ns
+            times = np.where(due, event_ns, times)
         return Gaussian(x, P), network_P
+
+    def _mixture(self, tracks: Tracks) -> Mixture:
+        filters = [(tracks.x, tracks.P), (tracks.x_a, tracks.P_a)][: len(self.filter.shares)]
+        return Mixture(tracks.log_w, tracks.log_g, Gaussian(*(np.stack(pair) for pair in zip(*filters, strict=True))))
+
+    def _with(self, tracks: Tracks, mixture: Mixture) -> Tracks:
+        """Tracks with other densities; where the factor associates for itself it is both filters."""
+        x, P = mixture.density
+        return tracks._replace(log_w=mixture.log_w, log_g=mixture.log_g, x=x[0], P=P[0], x_a=x[-1], P_a=P[-1])
+
+
+def _put(tracks: Tracks, rows: BoolArray, part: Tracks) -> Tracks:
+    tracks, part = _alike(tracks, part)
+    return put(tracks, rows, part)
+
+
+def _alike(first: Tracks, second: Tracks) -> tuple[Tracks, Tracks]:
+    """Both with the same number of components; those that are added are none."""
+    size = max(first.log_w.shape[1], second.log_w.shape[1])
+    return _grown(first, size), _grown(second, size)
+
+
+def _grown(tracks: Tracks, size: int) -> Tracks:
+    more = size - tracks.log_w.shape[1]
+    if not more:
+        return tracks
+    absent = np.full((len(tracks.ids), more), -np.inf)
+
+    def filled(array: Array) -> Array:
+        return np.concatenate([array, np.repeat(array[:, :1], more, axis=1)], axis=1)
+
+    return tracks._replace(
+        log_w=np.concatenate([tracks.log_w, absent], axis=1),
+        log_g=np.concatenate([tracks.log_g, absent], axis=1),
+        x=filled(tracks.x),
+        P=filled(tracks.P),
+        x_a=filled(tracks.x_a),
+        P_a=filled(tracks.P_a),
+    )
 
 
 def _interval(times_ns: IntArray, t_ns: int) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from common.config import Scenario
-from common.messages import NEVER, Advice, Decision, Join, Message, Report, Scan, Start, Stop, Tracks
+from common.messages import NEVER, Advice, Decision, Join, Message, Rebase, Report, Scan, Start, Stop, Tracks
 from fusion_center.center import Center
 from sensor_node.sources import schedule_of
 from sensor_node.tracker import LocalTracker
@@ -57,6 +57,9 @@ class Replay:
             case Advice():
                 for name, tracker in trackers.items():
                     nodes[name] = tracker.advise(nodes[name], message)
+            case Rebase():
+                for name, tracker in trackers.items():
+                    nodes[name] = tracker.rebase(nodes[name], message)
             case _:
                 pass
 

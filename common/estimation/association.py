@@ -76,6 +76,7 @@ class Expected(NamedTuple):
     Attributes:
         density: the predicted Gaussians, shapes (F, ..., n), (F, ..., n, n).
         z: expected plots, shape (F, ..., m).
+        sigma: standard deviations of the plots around them, shape (F, ..., m).
         whitener: L^-1 of ``S_k = L L'``, shape (F, ..., m, m).
         W: whitened gains, shape (F, ..., n, m).
         P_hit: covariances after a plot that is surely the target's, shape (F, ..., n, n).
@@ -88,6 +89,7 @@ class Expected(NamedTuple):
 
     density: Gaussian
     z: Array
+    sigma: Array
     whitener: Array
     W: Array
     P_hit: Array
@@ -127,12 +129,14 @@ def expect(predicted: Gaussian, sensor: Linearised, clutter: Clutter) -> Expecte
         what ``update`` needs.
     """
     PH = times_transposed(predicted.P, sensor.H)
-    white, half_log_det = whitener(symmetric(times_transposed(PH.mT, sensor.H)) + sensor.R)
+    S = symmetric(times_transposed(PH.mT, sensor.H)) + sensor.R
+    white, half_log_det = whitener(S)
     m = white.shape[-1]
     W = times_transposed(PH, white)
     return Expected(
         density=predicted,
         z=sensor.z,
+        sigma=np.sqrt(S.diagonal(axis1=-2, axis2=-1)),
         whitener=white,
         W=W,
         P_hit=joseph(predicted.P, W @ white, sensor.H, sensor.R),
@@ -172,8 +176,11 @@ def update(expected: Expected, plots: Plots, choose: Choice = normalise) -> Filt
     Returns:
         posteriors of all filters, shapes (F, ..., n), (F, ..., n, n), and log p_bar of the first, shape (...).
     """
-    plots = _within_reach(expected, plots)
-    nu = innovations(expected, plots)
+    plots = within_reach(expected, plots)
+    nu = innovations(plots.z, expected.z[..., None, :], expected.angular)
+    if plots.valid is not None:
+        # Padding may hold anything, and 0 times NaN is no zero.
+        nu = np.where(plots.valid[..., None], nu, 0.0)
     w = times_transposed(nu, expected.whitener)
     distance = squared_norm(w)
     log_pdf = expected.log_peak[..., None] - 0.5 * distance
@@ -186,29 +193,63 @@ def update(expected: Expected, plots: Plots, choose: Choice = normalise) -> Filt
     return Filtered(absorb(expected, w, q), log_p_bar)
 
 
-def innovations(expected: Expected, plots: Plots) -> Array:
-    """``nu_j = z_j - H x``, angles around the circle, shape (F, ..., M, m); 0 for padding."""
-    nu = plots.z - expected.z[..., None, :]
-    for i in expected.angular:
+def innovations(z: Array, expected: Array, angular: tuple[int, ...]) -> Array:
+    """``z - H x``, shapes (..., m), the differences of angles taken around the circle."""
+    nu: Array = z - expected
+    for i in angular:
         nu[..., i] = np.remainder(nu[..., i] + np.pi, 2.0 * np.pi) - np.pi
-    # Padding may hold anything, and 0 times NaN is no zero.
-    return nu if plots.valid is None else np.where(plots.valid[..., None], nu, 0.0)
+    return nu
 
 
-def _within_reach(expected: Expected, plots: Plots) -> Plots:
-    """For many tracks and the many plots of one scan, the plots inside the box around each track's gate.
+def within_reach(expected: Expected, plots: Plots) -> Plots:
+    """The plots inside the box around each track's gate, where that is less work than to look at all of them.
 
     With all plots the result would be the same, in a time that grows with the product of tracks and plots.
+
+    Args:
+        expected: the tracks, batch axes (F, ...).
+        plots: one scan, z of shape (M, m), or scans whose batch axes broadcast against those of the tracks.
+
+    Returns:
+        plots with the batch axes of the tracks, or of the scans.
     """
-    shared = plots.valid is None and plots.z.ndim == 2 and expected.z.ndim == 3
-    if not shared or len(plots.z) * expected.z.shape[1] <= _FEW_PAIRS or expected.gate == np.inf or expected.angular:
+    pairs = plots.z.shape[-2] * expected.z[0, ..., 0].size
+    if pairs <= _FEW_PAIRS or expected.gate == np.inf or expected.angular:
         return plots
-    L = np.linalg.inv(expected.whitener[-1])
     # A little more, so that rounding loses none.
-    reach = np.sqrt(expected.gate * np.square(L).sum(axis=-1)) * (1.0 + 1e-9)
-    near = inside_boxes(plots.z, expected.z[-1], reach)
+    reach = np.sqrt(expected.gate) * expected.sigma[-1] * (1.0 + 1e-9)
+    center = expected.z[-1]
+    if plots.z.ndim > 2:
+        return _inside_common_boxes(plots, center, reach)
+    if plots.valid is not None:
+        return plots
+    *batch, m = center.shape
+    near = inside_boxes(plots.z, center.reshape(-1, m), reach.reshape(-1, m))
+    which = near.which.reshape(*batch, -1)
+    return Plots(
+        plots.z[which],
+        near.valid.reshape(which.shape),
+        None if plots.log_relative is None else plots.log_relative[which],
+    )
+
+
+def _inside_common_boxes(plots: Plots, center: Array, reach: Array) -> Plots:
+    """Of scans that several tracks or components share, the plots inside the box around all their gates."""
+    low, high = center - reach, center + reach
+    shared = tuple(axis for axis, size in enumerate(plots.z.shape[:-2]) if size == 1)
+    low, high = low.min(axis=shared, keepdims=True)[..., None, :], high.max(axis=shared, keepdims=True)[..., None, :]
+    inside = ((low <= plots.z) & (plots.z <= high)).all(axis=-1)
+    if plots.valid is not None:
+        inside &= plots.valid
+    most = int(inside.sum(axis=-1).max(initial=0))
+    which = np.argsort(~inside, axis=-1, kind="stable")[..., :most]
+    z = np.take_along_axis(plots.z, which[..., None], axis=-2)
     relative = plots.log_relative
-    return Plots(plots.z[near.which], near.valid, None if relative is None else relative[near.which])
+    return Plots(
+        z,
+        np.take_along_axis(inside, which, axis=-1),
+        None if relative is None else np.take_along_axis(relative, which, axis=-1),
+    )
 
 
 @cache

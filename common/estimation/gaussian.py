@@ -181,6 +181,25 @@ def _whitener_of_few(P: Array) -> tuple[Array, Array]:
     return W, -np.log(W.diagonal(axis1=-2, axis2=-1)).sum(axis=-1)
 
 
+def quadratic(d: Array, S: Array) -> tuple[Array, Array]:
+    """``d' S^-1 d`` and ``0.5 log det S``, shapes (N, n), (N, n, n) to (N,), for S symmetric positive definite.
+
+    Elimination without pivots, the batch on the last axis: a step is a handful of operations on long rows.
+    """
+    # The upper triangle is enough.
+    A, b = np.ascontiguousarray(np.moveaxis(S, 0, -1)), np.ascontiguousarray(d.T)
+    total, determinant = np.zeros(len(d)), np.ones(len(d))
+    for k in range(len(b)):
+        pivot = A[k, k]
+        total += b[k] * b[k] / pivot
+        determinant *= pivot
+        factor = A[k, k + 1 :] / pivot
+        b[k + 1 :] -= factor * b[k]
+        for i in range(k + 1, len(b)):
+            A[i, i:] -= factor[i - k - 1] * A[k, i:]
+    return total, 0.5 * np.log(determinant)
+
+
 def joseph(P: Array, K: Array, H: Array, R: Array) -> Array:
     """Covariance of a Kalman update, ``(I - K H) P (I - K H)' + K R K'``.
 

@@ -1,0 +1,106 @@
+"""The filter of a node: every track predicted, expected, updated, in the factor and in the filter that associates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from common.config import Scenario
+from common.estimation.association import Choice, Clutter, Expected, Plots, expect, update
+from common.estimation.gaussian import Array, Gaussian
+from common.estimation.mixture import Mixture, Reduction, step, terms
+from common.estimation.motion import Motion
+from common.estimation.representation import Share
+from common.estimation.sensing import Sensor
+
+#: The honest prior and noise of the association filter.
+HONEST = Share(1.0)
+
+
+@dataclass(frozen=True)
+class LocalFilter:
+    """How a track's density is predicted and filtered; a single Gaussian is a mixture of one component.
+
+    Attributes:
+        motion: motion model.
+        share: the factor's share of prior and process noise.
+        tight: a filter of its own associates (theory.md §5).
+        choice: how a single Gaussian is associated; None: hypotheses are kept in a mixture.
+        reduction: how far a mixture may grow.
+        terms: most terms in a report.
+        gate_probability: that the target's plot is inside the gate.
+    """
+
+    motion: Motion
+    share: Share
+    tight: bool
+    choice: Choice | None
+    reduction: Reduction
+    terms: int
+    gate_probability: float
+
+    @classmethod
+    def of(cls, scenario: Scenario, share: Share | None = None) -> LocalFilter:
+        """The local filter of a scenario; with another share of the prior than its nodes', if given."""
+        fusion = scenario.fusion
+        return cls(
+            motion=scenario.motion.build(),
+            share=share or scenario.share,
+            tight=share is None and fusion.association != "factor",
+            choice=fusion.choice,
+            reduction=fusion.mixture.build(),
+            terms=fusion.terms,
+            gate_probability=fusion.gate_probability,
+        )
+
+    @property
+    def honest(self) -> LocalFilter:
+        """The filter that associates, alone."""
+        return replace(self, share=HONEST, tight=False)
+
+    @property
+    def shares(self) -> tuple[Share, ...]:
+        """Of the filters of a track, the one that associates last."""
+        return (self.share, HONEST) if self.tight else (self.share,)
+
+    def start(self, prior: Gaussian) -> Mixture:
+        """Tracks that start with ``prior``, shapes (T, n), (T, n, n)."""
+        filters = [share.start(prior) for share in self.shares]
+        density = Gaussian(*(np.stack(arrays)[:, :, None] for arrays in zip(*filters, strict=True)))
+        zero = np.zeros((len(prior.x), 1))
+        return Mixture(zero, zero, density)
+
+    def predict(self, prior: Mixture, *intervals: Array) -> Mixture:
+        """Predict all filters of all tracks (Eq. 5), each over its interval [s], shape () or (T,)."""
+        filters = [
+            share.predict(
+                Gaussian(prior.density.x[i], prior.density.P[i]), self.motion, dt[..., None] if dt.ndim else dt
+            )
+            for i, (share, dt) in enumerate(zip(self.shares, intervals, strict=False))
+        ]
+        return prior._replace(density=Gaussian(*(np.stack(arrays) for arrays in zip(*filters, strict=True))))
+
+    def expect(self, density: Gaussian, sensor: Sensor, stand: Array, center: Array) -> Expected:
+        """What a sensor will see of predicted tracks.
+
+        Args:
+            density: of all filters, shapes (F, T, C, n), (F, T, C, n, n).
+            sensor: the sensor model.
+            stand: where it stands [m], shape (d,).
+            center: of its field of view [m], shape (d,).
+        """
+        p_d = sensor.detection_probability(Gaussian(density.x[-1], density.P[-1]), stand, center)
+        clutter = Clutter(p_d, np.array(sensor.log_rho_f), self.gate_probability)
+        return expect(density, sensor.measurement.linearise(density, stand), clutter)
+
+    def update(self, predicted: Mixture, expected: Expected, plots: Plots) -> Mixture:
+        """Filter a scan, which all tracks share (z of shape (M, m)) or not (z of shape (T, 1, M, m))."""
+        if self.choice is None:
+            return step(predicted, expected, plots, self.reduction)
+        density, log_p_bar = update(expected, plots, self.choice)
+        return Mixture(predicted.log_w, predicted.log_g + log_p_bar, density)
+
+    def report(self, mixture: Mixture) -> Mixture:
+        """The terms of a report."""
+        return mixture if self.choice is not None else terms(mixture, self.terms)

@@ -16,10 +16,11 @@ from pydantic_core import ErrorDetails
 from common.errors import ConfigError
 from common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
 from common.estimation.gaussian import Array, Gaussian
-from common.estimation.motion import ConstantVelocity, Motion
+from common.estimation.motion import Motion
 from common.estimation.representation import Share
 from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import Thresholds, thresholds
+from common.motion_config import MotionConfig, motion_faults, numbers_per_axis
 from common.quantities import (
     NS_PER_S,
     WITHIN_RANGE,
@@ -60,18 +61,6 @@ class Origin(_Model):
 
     latitude: Annotated[float, Field(ge=-90.0, le=90.0, strict=True)]
     longitude: Annotated[float, Field(ge=-180.0, le=180.0, strict=True)]
-
-
-class MotionConfig(_Model):
-    """How targets move; psd in m^2/s^3."""
-
-    model: Literal["cv"] = "cv"
-    dimensions: Literal[2, 3] = 2
-    psd: NotNegative
-
-    def build(self) -> Motion:
-        """The motion model."""
-        return ConstantVelocity(self.dimensions, self.psd)
 
 
 class DecisionConfig(_Model):
@@ -213,7 +202,7 @@ class TargetConfig(_Model):
 
     Attributes:
         start: when it appears [s].
-        state: position and velocity [m, m/s].
+        state: position and velocity [m, m/s]; where targets accelerate, acceleration too [m/s^2].
         hypothesis: index of the hypothesis whose density it is drawn from.
     """
 
@@ -223,7 +212,7 @@ class TargetConfig(_Model):
 
 
 class HypothesisConfig(_Model):
-    """A track to be decided on: start [s], mean and standard deviations of position and velocity [m, m/s]."""
+    """A track to be decided on: start [s], mean and standard deviations of a state as ``TargetConfig`` has it."""
 
     start: Seconds = 0.0
     state: tuple[Finite, ...]
@@ -377,7 +366,9 @@ def _describe(detail: ErrorDetails) -> str:
 
 def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
     """Faults between keys; tolerant of whatever else is wrong, so that all faults are named at once."""
-    dimensions = _table(data, "motion").get("dimensions", 2)
+    motion = _table(data, "motion")
+    yield from motion_faults(data.get("motion"))
+    dimensions, per_axis = motion.get("dimensions", 2), numbers_per_axis(motion)
     sensors, hypotheses = _tables(data, "sensor"), _tables(data, "hypothesis")
     if dimensions in (2, 3):
         for i, sensor in enumerate(sensors):
@@ -386,7 +377,7 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
             yield from _wrong_length(fov, ("size", "center"), dimensions, f"sensor.{i}.field_of_view")
         for kind in ("hypothesis", "target"):
             for i, entry in enumerate(_tables(data, kind)):
-                yield from _wrong_length(entry, ("state", "sigma"), 2 * dimensions, f"{kind}.{i}")
+                yield from _wrong_length(entry, ("state", "sigma"), per_axis * dimensions, f"{kind}.{i}", " and motion")
     yield from _repeated_names(sensors)
     for i, target in enumerate(_tables(data, "target")):
         drawn = target.get("hypothesis")
@@ -410,11 +401,13 @@ def _tables(data: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
     return [entry if isinstance(entry, dict) else {} for entry in value] if isinstance(value, list) else []
 
 
-def _wrong_length(entry: Mapping[str, Any], keys: tuple[str, ...], length: int, where: str) -> Iterator[str]:
+def _wrong_length(
+    entry: Mapping[str, Any], keys: tuple[str, ...], length: int, where: str, also: str = ""
+) -> Iterator[str]:
     for key in keys:
         value = entry.get(key)
         if isinstance(value, list) and len(value) != length:
-            yield f"{where}.{key}: has {len(value)} numbers, this scenario's dimensions need {length}"
+            yield f"{where}.{key}: has {len(value)} numbers, this scenario's dimensions{also} need {length}"
 
 
 def _repeated_names(sensors: list[Mapping[str, Any]]) -> Iterator[str]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from common.estimation.gaussian import Array, Gaussian, identity, symmetric, times_transposed
 
-#: Of the power series of (theta - sin theta) / theta^3: 6 / (2 k + 3)! is below 1e-16 from the ninth on.
+#: Of the power series of (theta - sin theta) / theta^3: 6 / (2 k + 3)! is below 1e-16 from k = 8 on.
 _TERMS = 8
 
 
@@ -108,8 +108,8 @@ class CoordinatedTurn(NamedTuple):
         Q_vv = q dt I          Q_pp = 2 q dt^3 (theta - sin theta) / theta^3 I
         Q_pv = q dt^2 ((1 - cos theta) / theta^2 I - (theta - sin theta) / theta^2 J)
 
-    So F and Q of two intervals compose to those of their sum, and turn_rate = 0 is CV. Textbooks often take the Q of CV,
-    which does not compose.
+    So F and Q of two intervals compose to those of their sum, and turn_rate = 0 is CV. Textbooks often take the Q of
+    CV, which does not compose.
 
     Attributes:
         dimensions: of the position, 2 or 3.

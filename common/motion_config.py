@@ -39,7 +39,8 @@ class MotionConfig(BaseModel, extra="forbid", frozen=True):
     Attributes:
         model: constant velocity, constant acceleration, a coordinated turn, or several models (imm).
         dimensions: of the position.
-        psd: of the process noise [m^2/s^3, for ca m^2/s^5]; with imm every model has its own.
+        psd: of the process noise [m^2/s^3, for ca m^2/s^5]; with imm every model has its own, and this one is of the
+            single model that stands for all where only one can be had, such as the center's prediction.
         turn_rate: of ct, counter-clockwise seen from above [rad/s].
         sojourn: of imm: mean time until a target takes another model [s].
         models: of imm, two or more that share one state: cv and ct, or ca.
@@ -56,7 +57,7 @@ class MotionConfig(BaseModel, extra="forbid", frozen=True):
         """The motion model."""
         if self.model == "imm":
             assert self.sojourn is not None and self.models is not None
-            return Imm.of(tuple(model.build(self.dimensions) for model in self.models), self.sojourn)
+            return Imm.of(tuple(model.build(self.dimensions) for model in self.models), self.sojourn, self.psd)
         assert self.psd is not None
         return _kinematic(self.model, self.dimensions, self.psd, self.turn_rate)
 
@@ -91,10 +92,16 @@ def motion_faults(motion: object) -> Iterator[str]:
 
 
 def _imm_faults(motion: Mapping[str, Any]) -> Iterator[str]:
-    for key in sorted({"psd", "turn_rate"} & motion.keys()):
-        yield f"motion.{key}: with model = 'imm' every entry of motion.models has its own"
+    if "turn_rate" in motion:
+        yield "motion.turn_rate: with model = 'imm' every entry of motion.models has its own"
     for key in sorted({"sojourn", "models"} - motion.keys()):
         yield f"motion.{key}: is missing"
+    rates = [entry.get("turn_rate", 0.0) for entry in _entries(motion)]
+    if "psd" not in motion and any(rate != rates[0] for rate in rates):
+        yield (
+            "motion.psd: is missing; the models turn at different rates, and the single model that stands for all "
+            "where only one can be had needs a psd that covers them"
+        )
     kinds = {str(entry.get("model", "cv")) for entry in _entries(motion)}
     if "ca" in kinds and kinds & {"cv", "ct"}:
         yield "motion.models: the state of 'ca' has accelerations, that of 'cv' and 'ct' none; all must share one"

@@ -26,6 +26,7 @@ duration = 20.0
 """
 TURNS = """
 model = "imm"
+psd = 30.0
 sojourn = 25.0
 [[motion.models]]
 psd = 0.5
@@ -60,7 +61,11 @@ def target(count: int) -> str:
         ('model = "ca"\npsd = 0.5', ConstantAcceleration(2, 0.5)),
         ('model = "ct"\npsd = 0.5\nturn_rate = -0.1', CoordinatedTurn(2, 0.5, -0.1)),
         ('model = "ct"\npsd = 0.5\nturn_rate = 0', CoordinatedTurn(2, 0.5, 0.0)),
-        (TURNS, Imm.of((ConstantVelocity(2, 0.5), CoordinatedTurn(2, 1.5, 0.1)), 25.0)),
+        (
+            'model = "imm"\nsojourn = 9.0\nmodels = [{ psd = 1.0 }, { model = "ct", psd = 2.0, turn_rate = 0 }]',
+            Imm.of((ConstantVelocity(2, 1.0), CoordinatedTurn(2, 2.0, 0.0)), 9.0),
+        ),
+        (TURNS, Imm.of((ConstantVelocity(2, 0.5), CoordinatedTurn(2, 1.5, 0.1)), 25.0, 30.0)),
         (
             'model = "imm"\nsojourn = 9.0\nmodels = [{ model = "ca", psd = 0 }, { model = "ca", psd = 5.0 }]',
             Imm.of((ConstantAcceleration(2, 0.0), ConstantAcceleration(2, 5.0)), 9.0),
@@ -86,7 +91,13 @@ def test_a_model_is_built(tmp_path: Path, motion: str, expected: Motion) -> None
         ),
         ('model = "imm"', ["motion.models: is missing", "motion.sojourn: is missing"]),
         (TURNS.replace("25.0", "0.0"), ["motion.sojourn: 0 is not positive and finite"]),
-        (f"psd = 1.0{TURNS}", ["motion.psd: with model = 'imm' every entry of motion.models has its own"]),
+        (
+            TURNS.replace("psd = 30.0\n", ""),
+            [
+                "motion.psd: is missing; the models turn at different rates, and the single model that stands for all "
+                "where only one can be had needs a psd that covers them"
+            ],
+        ),
         (f"turn_rate = 1.0{TURNS}", ["motion.turn_rate: with model = 'imm' every entry of motion.models has its own"]),
         (TURNS.replace("turn_rate = 0.1", ""), ["motion.models.1.turn_rate: is missing"]),
         (TURNS.replace("psd = 0.5", ""), ["motion.models.0.psd: is missing"]),

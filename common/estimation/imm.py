@@ -43,13 +43,15 @@ class Imm(NamedTuple):
     Attributes:
         models: r of them, of states of the same kind.
         sojourn: mean time until the target takes another model [s].
+        psd: of the nominal model; None: the mean of the models'.
     """
 
     models: tuple[Kinematic, ...]
     sojourn: float
+    psd: float | None = None
 
     @classmethod
-    def of(cls, models: tuple[Kinematic, ...], sojourn: float) -> Imm:
+    def of(cls, models: tuple[Kinematic, ...], sojourn: float, psd: float | None = None) -> Imm:
         """Several models of one target.
 
         Raises:
@@ -59,7 +61,7 @@ class Imm(NamedTuple):
             raise ValueError(f"{models}: at least one model is needed, and all must share one state")
         if not sojourn > 0.0:
             raise ValueError(f"sojourn = {sojourn}: is not positive")
-        return cls(models, sojourn)
+        return cls(models, sojourn, psd)
 
     @property
     def n(self) -> int:
@@ -73,23 +75,55 @@ class Imm(NamedTuple):
 
     @property
     def nominal(self) -> Kinematic:
-        """The one linear model in the place of all: mean psd and mean turn rate.
+        """The one linear model in the place of all: mean turn rate, and mean psd unless another is given.
 
         The densities that the models predict over dt, averaged with the stationary probabilities, have the mean
         ``mean(F_i) x``. Taken over a whole interval that is no motion model: two intervals do not make their sum (with
         turns to either side the speed would shrink by cos(turn_rate dt) at every step, however the steps are cut), and
         the covariance depends on x. Averaged again and again over ever shorter intervals it has a limit, linear and
-        the same for all x: the models' mean drift and mean spectral density. That is this model; its F and Q compose.
+        the same for all x: the models' mean drift and mean spectral density. Its F and Q compose, so it is this model.
 
-        For models that differ in psd only this is exact for a single step. It knows nothing of how far turns to either
-        side lead apart; who has the state at hand and needs that too takes ``predict_stationary``.
+        For models that differ in psd only it is exact for a single step. That a target keeps turning to one side for a
+        while the limit does not see; as noise that is worth ``turning_psd``, which ``psd`` should then contain.
         """
-        psd = float(np.mean([model.psd for model in self.models]))
+        psd = float(np.mean([model.psd for model in self.models])) if self.psd is None else self.psd
         if isinstance(self.models[0], ConstantAcceleration):
             return ConstantAcceleration(self.dimensions, psd)
-        turns = [model.turn_rate if isinstance(model, CoordinatedTurn) else 0.0 for model in self.models]
-        rate = float(np.mean(turns))
+        rate = float(np.mean(self._turn_rates))
         return CoordinatedTurn(self.dimensions, psd, rate) if rate else ConstantVelocity(self.dimensions, psd)
+
+    @property
+    def _turn_rates(self) -> list[float]:
+        return [model.turn_rate if isinstance(model, CoordinatedTurn) else 0.0 for model in self.models]
+
+    def turning_psd(self, speed: float, horizon: float) -> float:
+        """What the spread of turn rates is worth as white-noise acceleration, to first order.
+
+        The acceleration across the velocity, ``(omega - mean omega) speed``, has the variance of the turn rates times
+        speed^2 and the correlation ``exp(-lambda t)`` of the chain, lambda = r / ((r - 1) sojourn). White noise of
+
+            q = var(omega) speed^2 (lambda h - 1 + exp(-lambda h)) / (lambda^2 h)
+
+        on each horizontal axis spreads the velocity over the horizon h alike, in the mean over its directions; over
+        less it spreads too much, over more too little.
+
+        Args:
+            speed: of the target [m/s].
+            horizon: over how long [s]; for a filter its memory, a few scans.
+
+        Returns:
+            power spectral density [m^2/s^3].
+        """
+        u = horizon * self._rate
+        # The series where all digits would cancel.
+        part = (u + np.expm1(-u)) / u**2 if u > 1e-5 else 0.5 - u / 6.0
+        return float(np.var(self._turn_rates) * speed**2 * horizon * part)
+
+    @property
+    def _rate(self) -> float:
+        """At which the chain forgets [1/s]."""
+        r = len(self.models)
+        return r / (max(r - 1, 1) * self.sojourn)
 
     def transition(self, dt: Array) -> Array:
         """F of the nominal model over ``dt`` seconds, shape (...) to (..., n, n)."""
@@ -112,7 +146,7 @@ class Imm(NamedTuple):
             shape (..., r, r), [i, j] from i to j.
         """
         r = len(self.models)
-        other = -np.expm1(-dt * r / (max(r - 1, 1) * self.sojourn)) / r
+        other = -np.expm1(-dt * self._rate) / r
         eye = np.eye(r)
         off = np.asarray(other)[..., None, None]
         return eye * (1.0 - (r - 1) * off) + (1.0 - eye) * off

@@ -132,6 +132,8 @@ def test_nominal_models() -> None:
     assert FAMILIES["psd"].nominal == ConstantVelocity(2, 20.25)
     assert THREE.nominal == ConstantVelocity(2, 2.5 / 3.0)
     assert FAMILIES["acceleration"].nominal == ConstantAcceleration(2, 2.55)
+    assert Imm.of(THREE.models, 12.0, 70.0).nominal == ConstantVelocity(2, 70.0)
+    assert Imm.of(FAMILIES["acceleration"].models, 12.0, 0.0).nominal == ConstantAcceleration(2, 0.0)
     assert FAMILIES["space"].nominal == CoordinatedTurn(3, 1.0, 0.05)
 
 

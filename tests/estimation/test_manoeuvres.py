@@ -72,6 +72,30 @@ def test_the_turn_has_the_variance_of_a_telegraph_signal(intervals: int) -> None
     assert abs(np.mean(turned**2) - expected) < 5.0 * np.std(turned**2) / np.sqrt(runs)
 
 
+@pytest.mark.parametrize("sojourn", [0.5, 6.0, 200.0])
+def test_turns_spread_the_velocity_as_their_psd_says(sojourn: float) -> None:
+    """Across the velocity white noise of the psd on each axis has half of the variance: within 5 sigma."""
+    speed, horizon, runs = 50.0, 4.0, 1500
+    rates = (0.01, -0.01, 0.0, 0.02)
+    imm = Imm.of(tuple(CoordinatedTurn(2, 0.0, rate) for rate in rates), sojourn)
+    rng = np.random.default_rng(int(sojourn))
+    paths = np.stack([draw_path(imm, EASTWARD, np.array([horizon]), rng)[0] for _ in range(runs)])
+    across = paths[:, 3] - speed * np.mean(rates) * horizon
+    expected = 2.0 * imm.turning_psd(speed, horizon) * horizon
+    assert abs(np.mean(across**2) - expected) < 5.0 * np.std(across**2) / np.sqrt(runs)
+
+
+def test_psd_of_turns_in_the_limits() -> None:
+    """Long memory: var speed^2 / lambda; turns for ever: var speed^2 h / 2; the series joins the closed form."""
+    turns = CoordinatedTurn(2, 1.0, 0.1), CoordinatedTurn(2, 1.0, -0.1)
+    assert Imm.of(turns, 4.0).turning_psd(30.0, 1e9) == pytest.approx(0.01 * 900.0 / 0.5)
+    assert Imm.of(turns, np.inf).turning_psd(30.0, 3.0) == pytest.approx(0.01 * 900.0 * 1.5)
+    assert Imm.of(turns, 1.0).turning_psd(30.0, 5.1e-6) == pytest.approx(
+        Imm.of(turns, 1.0).turning_psd(30.0, 4.9e-6) * 5.1 / 4.9, rel=1e-5
+    )
+    assert Imm.of((ConstantVelocity(2, 1.0), ConstantVelocity(2, 9.0)), 4.0).turning_psd(30.0, 5.0) == 0.0
+
+
 class World(NamedTuple):
     """Runs of one target amid false plots.
 
@@ -139,6 +163,18 @@ def test_the_imm_follows_manoeuvres_that_no_constant_velocity_follows() -> None:
         error_cv, log_lr_cv = filtered(Imm.of((ConstantVelocity(2, psd),), 1.0), seen)
         assert surely_positive(np.log(error_cv / error))
         assert surely_positive(log_lr - log_lr_cv)
+
+
+def test_the_nominal_model_needs_the_psd_of_turns() -> None:
+    """The models' mean psd loses nearly all of 200 tracks (> 200 m); that of turns over 3 scans few."""
+    turns = Imm.of((CoordinatedTurn(2, 0.1, 0.15), CoordinatedTurn(2, 0.1, -0.15), ConstantVelocity(2, 0.1)), 20.0)
+    seen = world(turns, 200, 40, np.random.default_rng(1))
+    lost = []
+    for psd in (None, turns.turning_psd(60.0, 3.0 * DT)):
+        error, _ = filtered(Imm.of((Imm.of(turns.models, 20.0, psd).nominal,), 1.0), seen)
+        lost.append((error > 200.0).mean())
+    assert lost[0] > 0.9
+    assert lost[1] < 0.1
 
 
 def test_the_imm_loses_little_where_nothing_manoeuvres() -> None:

@@ -7,7 +7,7 @@ One step: ``mix`` (the chain moves on, and each mode gathers what the others bec
 filter per mode, whose evidence updates the weights. Weights are logarithms wherever they may be tiny.
 
 References:
-    theory.md §1; Blom & Bar-Shalom, The interacting multiple model algorithm for systems with Markovian switching
+    theory.md Eq. (1a) to (1c); Blom & Bar-Shalom, The interacting multiple model algorithm for systems with Markovian switching
     coefficients, IEEE TAC 33(8), 1988; Bar-Shalom, Li & Kirubarajan, Estimation with applications to tracking and
     navigation, §11.6.6.
 """
@@ -97,7 +97,7 @@ class Imm(NamedTuple):
         return [model.turn_rate if isinstance(model, CoordinatedTurn) else 0.0 for model in self.models]
 
     def turning_psd(self, speed: float, horizon: float) -> float:
-        """What the spread of turn rates is worth as white-noise acceleration, to first order.
+        """What the spread of turn rates is worth as white-noise acceleration, to first order (Eq. 1c).
 
         The acceleration across the velocity, ``(omega - mean omega) speed``, has the variance of the turn rates times
         speed^2 and the correlation ``exp(-lambda t)`` of the chain, lambda = r / ((r - 1) sojourn). White noise of
@@ -198,7 +198,7 @@ def start(prior: Gaussian, imm: Imm) -> Modes:
 
 
 def mix(mu: Array, densities: Gaussian, transition: Array) -> tuple[Array, Gaussian]:
-    """The chain moves on: what the modes will be, and the density of each given that it will be that mode.
+    """The chain moves on: what the modes will be, and the density of each given that it will be that mode (Eq. 1a).
 
         mu'_j = sum_i mu_i Pi_ij          density'_j: moments of the densities i, with weights mu_i Pi_ij / mu'_j
 
@@ -212,7 +212,7 @@ def mix(mu: Array, densities: Gaussian, transition: Array) -> tuple[Array, Gauss
         keeps its own density.
 
     References:
-        Bar-Shalom, Li & Kirubarajan §11.6.6, Eq. 11.6.6-7 to -10.
+        theory.md Eq. (1a); Bar-Shalom, Li & Kirubarajan §11.6.6, steps 1 and 2.
     """
     log_mu, mixed = mix_log(_log(mu), densities, transition)
     return np.exp(log_mu), mixed
@@ -296,7 +296,7 @@ def merge(log_mu: Array, densities: Gaussian) -> Gaussian:
 
 
 def imm_pdaf(predicted: Modes, plots: Plots, sensor: Linearised, clutter: Clutter) -> FilteredModes:
-    """One scan filtered by a PDAF in every mode, each with its own gate (Eq. 6, 7).
+    """One scan filtered by a PDAF in every mode, each with its own gate (Eq. 1b, 6, 7).
 
         p_bar = sum_r mu_r p_bar_r          mu_r <- mu_r p_bar_r / p_bar
 
@@ -311,7 +311,7 @@ def imm_pdaf(predicted: Modes, plots: Plots, sensor: Linearised, clutter: Clutte
         nothing on the mode.
 
     References:
-        theory.md Eq. (6), (7); Bar-Shalom, Li & Kirubarajan §11.6.6.
+        theory.md Eq. (1b), (6), (7); Bar-Shalom, Li & Kirubarajan §11.6.6.
     """
     valid = None if plots.valid is None else plots.valid[..., None, :]
     per_mode = clutter._replace(p_d=clutter.p_d[..., None], log_rho_f=clutter.log_rho_f[..., None])

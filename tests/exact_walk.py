@@ -46,8 +46,8 @@ def leave(a: float, b: float, d: float, under_h1: bool, nodes: int = 400) -> Exi
 
 
 def ever_above(b: float, d: float) -> float:
-    """P(sup LR >= e^b | h0) without a lower threshold: one so low that no walk comes back from it (e^-60)."""
-    return leave(-60.0, b, d, under_h1=False, nodes=1200).above
+    """P(sup LR >= e^b | h0) without a lower threshold: one so low that no walk comes back from it (e^-35)."""
+    return leave(-35.0, b, d, under_h1=False, nodes=400).above
 
 
 def renewal_constant(d: float) -> float:

@@ -75,15 +75,15 @@ def test_a_mode_that_is_sure_too_soon_is_found_out() -> None:
 
 
 def test_intervals_cover_as_often_as_they_say() -> None:
-    """200 estimates from 400 runs each; the coverage of 90 % intervals, normal and bootstrap, fits 90 % (99.9 %)."""
+    """120 estimates from 400 runs each; the coverage of 90 % intervals, normal and bootstrap, fits 90 % (99.9 %)."""
     rng, covered = np.random.default_rng(6), np.zeros(2, np.int64)
     exact = ever_above(float(np.log(1e3)), 1.0)
-    for _ in range(200):
+    for _ in range(120):
         true, mode = log_lrs(1.0, 1.0, 400, 80, rng, believed=1.0)
         ours = calibration(mode, true, np.array([1e3]), rng, confidence=0.9)
         covered += [bool(low < exact < high) for low, high in (ours.normal, ours.bootstrap)]
     for count in covered:
-        assert binomtest(int(count), 200, 0.9).pvalue > 1e-3
+        assert binomtest(int(count), 120, 0.9).pvalue > 1e-3
 
 
 def test_every_run_counts_at_its_first_crossing() -> None:

@@ -7,9 +7,9 @@ One step: ``mix`` (the chain moves on, and each mode gathers what the others bec
 filter per mode, whose evidence updates the weights. Weights are logarithms wherever they may be tiny.
 
 References:
-    theory.md Eq. (1a) to (1c); Blom & Bar-Shalom, The interacting multiple model algorithm for systems with Markovian switching
-    coefficients, IEEE TAC 33(8), 1988; Bar-Shalom, Li & Kirubarajan, Estimation with applications to tracking and
-    navigation, §11.6.6.
+    theory.md Eq. (1a) to (1c); Blom & Bar-Shalom, The interacting multiple model algorithm for systems with Markovian
+    switching coefficients, IEEE TAC 33(8), 1988; Bar-Shalom, Li & Kirubarajan, Estimation with applications to
+    tracking and navigation, §11.6.6.
 """
 
 from __future__ import annotations

@@ -24,8 +24,6 @@ from scipy.special import ndtri
 from common.estimation.gaussian import Array
 
 _BOOTSTRAPS = 1000
-# Rows of resampled counts at once: bounds the memory.
-_CHUNK = 50
 
 
 class Interval(NamedTuple):
@@ -137,9 +135,8 @@ def crossing_weights(log_lr_mode: Array, log_weight: Array, log_b: Array) -> Arr
 def _resampled_means(w: Array, rng: np.random.Generator) -> Array:
     """Means over runs drawn anew with replacement, shape (R, G) to (bootstraps, G)."""
     runs = len(w)
-    equal = np.full(runs, 1.0 / runs)
-    chunks = [rng.multinomial(runs, equal, size=_CHUNK) @ w / runs for _ in range(0, _BOOTSTRAPS, _CHUNK)]
-    return np.concatenate(chunks)
+    counts = (np.bincount(rng.integers(runs, size=runs), minlength=runs) for _ in range(_BOOTSTRAPS))
+    return np.stack([drawn @ w for drawn in counts]) / runs
 
 
 def _interval(low: Array, high: Array, crossed: Array) -> Interval:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +143,14 @@ def test_a_state_has_the_numbers_of_its_model(tmp_path: Path, motion: str, count
         assert faults(tmp_path, motion, target(wrong)) == [
             f"target.0.state: has {wrong} numbers, this scenario's dimensions and motion need {count}"
         ]
+
+
+def test_the_motion_of_the_how_to_is_one(tmp_path: Path) -> None:
+    text = (Path(__file__).parent.parent / "docs/how-to/first-network.md").read_text()
+    table = next(block for block in re.findall(r"```toml\n(.*?)```", text, re.DOTALL) if "imm" in block)
+    built = load_scenario(file(tmp_path, table.removeprefix("[motion]\n"))).motion.build()
+    assert isinstance(built, Imm)
+    assert [type(model) for model in built.models] == [ConstantVelocity, CoordinatedTurn, CoordinatedTurn]
 
 
 def test_a_target_of_several_models_changes_between_them(tmp_path: Path) -> None:

@@ -133,6 +133,14 @@ class Imm(NamedTuple):
         """Q of the nominal model over ``dt`` seconds, shape (...) to (..., n, n)."""
         return self.nominal.noise(dt)
 
+    def transitions(self, dt: Array) -> Array:
+        """F of every model over ``dt`` seconds, shape (...) to (..., r, n, n)."""
+        return np.stack([model.transition(dt) for model in self.models], axis=-3)
+
+    def noises(self, dt: Array) -> Array:
+        """Q of every model over ``dt`` seconds, shape (...) to (..., r, n, n)."""
+        return np.stack([model.noise(dt) for model in self.models], axis=-3)
+
     def mode_transition(self, dt: Array) -> Array:
         """Probabilities of mode j after ``dt`` seconds given mode i before: expm(generator dt), rows sum to one.
 
@@ -242,9 +250,7 @@ def predict_models(densities: Gaussian, imm: Imm, dt: Array, multiplicity: float
     Returns:
         the predicted densities.
     """
-    F = np.stack([model.transition(dt) for model in imm.models], axis=-3)
-    Q = np.stack([model.noise(dt) for model in imm.models], axis=-3)
-    return predict(densities, F, multiplicity * Q)
+    return predict(densities, imm.transitions(dt), multiplicity * imm.noises(dt))
 
 
 def predict_modes(modes: Modes, imm: Imm, dt: Array, multiplicity: float = 1.0) -> Modes:

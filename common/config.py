@@ -14,21 +14,20 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from common.errors import ConfigError
-from common.estimation.association import Choice, kalman, nearest, normalise
 from common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
 from common.estimation.gaussian import Array, Gaussian
-from common.estimation.mixture import Reduction
-from common.estimation.motion import ConstantVelocity, Motion
+from common.estimation.motion import Motion
 from common.estimation.representation import Share
 from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import Thresholds, thresholds
+from common.fusion_config import FusionConfig, fusion_faults
+from common.motion_config import MotionConfig, motion_faults, numbers_per_axis
 from common.quantities import (
     NS_PER_S,
     WITHIN_RANGE,
     Count,
     FalsePlots,
     Finite,
-    GateProbability,
     InnerProbability,
     Instant,
     Name,
@@ -37,8 +36,6 @@ from common.quantities import (
     Probability,
     Seconds,
 )
-
-CHOICES: dict[str, Choice] = {"kalman": kalman, "nearest": nearest, "pdaf": normalise}
 
 
 class _Model(BaseModel):
@@ -66,18 +63,6 @@ class Origin(_Model):
     longitude: Annotated[float, Field(ge=-180.0, le=180.0, strict=True)]
 
 
-class MotionConfig(_Model):
-    """How targets move; psd in m^2/s^3."""
-
-    model: Literal["cv"] = "cv"
-    dimensions: Literal[2, 3] = 2
-    psd: NotNegative
-
-    def build(self) -> Motion:
-        """The motion model."""
-        return ConstantVelocity(self.dimensions, self.psd)
-
-
 class DecisionConfig(_Model):
     """Wald's test: p0 accept h1 under h0, p1 accept h1 under h1; not enabled, LR is computed and nothing decided."""
 
@@ -89,61 +74,6 @@ class DecisionConfig(_Model):
     def thresholds(self) -> Thresholds:
         """Log A and log B."""
         return thresholds(self.p0, self.p1)
-
-
-class MixtureConfig(_Model):
-    """How far the mixture of a track may grow (theory.md §9).
-
-    Attributes:
-        components: most components of a track.
-        prune: hypotheses lighter than this share of the heaviest are dropped.
-        combine: hypotheses closer than this to a heavier one (squared Mahalanobis distance) are combined with it.
-    """
-
-    components: Annotated[int, Field(ge=1, le=1000, strict=True)] = 15
-    prune: Annotated[NotNegative, Field(lt=1.0)] = 1e-4
-    combine: NotNegative = 0.5
-
-    def build(self) -> Reduction:
-        """The reduction of mixtures."""
-        return Reduction(self.components, self.prune, self.combine)
-
-
-class FusionConfig(_Model):
-    """How the network shares a density and who associates.
-
-    Attributes:
-        mode: representation of the product (theory.md §4).
-        association: the factor's own, tight, or mirrored: hypotheses kept in both filters (theory.md §5).
-        terms: most terms of a track in a report; more than one only where association is mirrored.
-        feedback: advice gives the fused track back to the association filters, reset to the factors (theory.md §3, 6).
-        feedback_delay: measurement time that goes by before the center gives feedback [s], to study slow links.
-        filter: local filter; default: mht where association is mirrored, else pdaf.
-        mixture: of filter mht.
-        precision: of means and covariances in reports; float32 halves them.
-        gate_probability: that the target's plot lies inside the gate; 1 is no gate.
-        hold_back: how long the center waits for a sensor that is overdue [s].
-        window: how far back a late report is still worked in [s of measurement time].
-    """
-
-    mode: Literal["naive", "federated", "dkf"] = "federated"
-    association: Literal["factor", "tight", "mirrored"] = "tight"
-    terms: Annotated[int, Field(ge=1, le=64, strict=True)] = 1
-    feedback: Literal["none", "advice", "reset"] = "none"
-    feedback_delay: NotNegative = 0.0
-    filter: Literal["kalman", "nearest", "pdaf", "mht"] | None = None
-    mixture: MixtureConfig = MixtureConfig()
-    precision: Literal["float64", "float32"] = "float64"
-    gate_probability: GateProbability = 0.9997
-    hold_back: NotNegative = 0.5
-    window: NotNegative = 10.0
-
-    @property
-    def choice(self) -> Choice | None:
-        """How a single Gaussian is associated; None: hypotheses are kept in a mixture."""
-        if self.association == "mirrored" or self.filter == "mht":
-            return None
-        return CHOICES[self.filter or "pdaf"]
 
 
 class EverywhereConfig(_Model):
@@ -248,7 +178,7 @@ class TargetConfig(_Model):
 
     Attributes:
         start: when it appears [s].
-        state: position and velocity [m, m/s].
+        state: position and velocity [m, m/s]; where targets accelerate, acceleration too [m/s^2].
         hypothesis: index of the hypothesis whose density it is drawn from.
     """
 
@@ -258,7 +188,7 @@ class TargetConfig(_Model):
 
 
 class HypothesisConfig(_Model):
-    """A track to be decided on: start [s], mean and standard deviations of position and velocity [m, m/s]."""
+    """A track to be decided on: start [s], mean and standard deviations of a state as ``TargetConfig`` has it."""
 
     start: Seconds = 0.0
     state: tuple[Finite, ...]
@@ -412,7 +342,9 @@ def _describe(detail: ErrorDetails) -> str:
 
 def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
     """Faults between keys; tolerant of whatever else is wrong, so that all faults are named at once."""
-    dimensions = _table(data, "motion").get("dimensions", 2)
+    motion = _table(data, "motion")
+    yield from motion_faults(data.get("motion"))
+    dimensions, per_axis = motion.get("dimensions", 2), numbers_per_axis(motion)
     sensors, hypotheses = _tables(data, "sensor"), _tables(data, "hypothesis")
     if dimensions in (2, 3):
         for i, sensor in enumerate(sensors):
@@ -421,7 +353,7 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
             yield from _wrong_length(fov, ("size", "center"), dimensions, f"sensor.{i}.field_of_view")
         for kind in ("hypothesis", "target"):
             for i, entry in enumerate(_tables(data, kind)):
-                yield from _wrong_length(entry, ("state", "sigma"), 2 * dimensions, f"{kind}.{i}")
+                yield from _wrong_length(entry, ("state", "sigma"), per_axis * dimensions, f"{kind}.{i}", " and motion")
     yield from _repeated_names(sensors)
     for i, target in enumerate(_tables(data, "target")):
         drawn = target.get("hypothesis")
@@ -430,29 +362,7 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
         elif isinstance(drawn, int) and drawn >= len(hypotheses):
             yield f"target.{i}.hypothesis: {drawn} is not one of the {len(hypotheses)} hypotheses (counted from 0)"
     yield from _decision_faults(_table(data, "decision"))
-    yield from _fusion_faults(_table(data, "fusion"))
-
-
-def _fusion_faults(fusion: Mapping[str, Any]) -> Iterator[str]:
-    mode, association, filter_ = (
-        fusion.get(key, default) for key, default in (("mode", "federated"), ("association", "tight"), ("filter", None))
-    )
-    feedback, terms = fusion.get("feedback", "none"), fusion.get("terms", 1)
-    mixture = association == "mirrored" or filter_ == "mht"
-    if feedback == "advice" and (association != "tight" or mixture):
-        yield (
-            "fusion.feedback: 'advice' steers the association filter of a single Gaussian, "
-            "which only association = 'tight' with another filter than 'mht' has"
-        )
-    if association == "mirrored" and filter_ not in (None, "mht"):
-        yield f"fusion.filter: {filter_!r} keeps one hypothesis; association = 'mirrored' needs 'mht', or no filter key"
-    if association != "mirrored" and isinstance(terms, int) and terms > 1:
-        yield f"fusion.terms: {terms} terms of a report need association = 'mirrored'"
-    if mode == "dkf" and (mixture or feedback == "reset"):
-        yield "fusion.mode: 'dkf' needs covariances that do not depend on data: no mixture, no feedback = 'reset'"
-    delay, window = fusion.get("feedback_delay", 0.0), fusion.get("window", 10.0)
-    if isinstance(delay, int | float) and isinstance(window, int | float) and delay > window:
-        yield f"fusion.feedback_delay: {delay} s is longer than the {window} s (fusion.window) that nodes keep scans"
+    yield from fusion_faults(_table(data, "fusion"), motion.get("model"))
 
 
 def _table(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
@@ -465,11 +375,13 @@ def _tables(data: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
     return [entry if isinstance(entry, dict) else {} for entry in value] if isinstance(value, list) else []
 
 
-def _wrong_length(entry: Mapping[str, Any], keys: tuple[str, ...], length: int, where: str) -> Iterator[str]:
+def _wrong_length(
+    entry: Mapping[str, Any], keys: tuple[str, ...], length: int, where: str, also: str = ""
+) -> Iterator[str]:
     for key in keys:
         value = entry.get(key)
         if isinstance(value, list) and len(value) != length:
-            yield f"{where}.{key}: has {len(value)} numbers, this scenario's dimensions need {length}"
+            yield f"{where}.{key}: has {len(value)} numbers, this scenario's dimensions{also} need {length}"
 
 
 def _repeated_names(sensors: list[Mapping[str, Any]]) -> Iterator[str]:

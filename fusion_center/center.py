@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.config import FusionConfig, Scenario
+from common.config import Scenario
 from common.estimation.batch import take
 from common.estimation.gaussian import Array, Gaussian, moments
 from common.estimation.sprt import DELETED
+from common.fusion_config import FusionConfig
 from common.messages import (
     NEVER,
     Advice,

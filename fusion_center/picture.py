@@ -11,6 +11,7 @@ import numpy as np
 from common.config import Scenario
 from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, log_sum_exp, whitener
+from common.estimation.imm import Imm, Modes, predict_modes
 from common.estimation.mixture_product import multiply_mixtures
 from common.estimation.motion import Motion
 from common.estimation.ratio import log_lambda
@@ -112,7 +113,7 @@ class Expected(NamedTuple):
         kept: the tracks that had not been deleted.
         live: which of them started before.
         moving: those.
-        factors: those, predicted.
+        log_a, factors: those, predicted.
         whitened: the same, taken apart.
         product: of the predicted factors.
         network_P: for ``dkf``, the covariances that all factors have by the models alone, predicted.
@@ -123,6 +124,7 @@ class Expected(NamedTuple):
     kept: Picture
     live: BoolArray
     moving: Picture
+    log_a: Array
     factors: Gaussian
     whitened: Whitened
     product: Product
@@ -175,7 +177,7 @@ class Fuser:
             motion=motion,
             sensors=tuple(sensor.build(motion) for sensor in scenario.sensors),
             share=scenario.share,
-            terms=scenario.fusion.terms,
+            terms=len(motion.models) if isinstance(motion, Imm) else scenario.fusion.terms,
             limits=scenario.decision.thresholds if scenario.decision.enabled else None,
             globalised=scenario.fusion.mode == "dkf",
         )
@@ -270,6 +272,8 @@ class Fuser:
         n_sensors, factor = len(self.sensors), self.share.start(densities)
         log_a = np.full((len(factor.x), n_sensors, self.terms), -np.inf)
         log_a[:, :, 0] = 0.0
+        if isinstance(self.motion, Imm):
+            log_a[:] = -np.log(self.terms)
         x, P = (np.repeat(np.repeat(part[:, None, None], n_sensors, axis=1), self.terms, axis=2) for part in factor)
         return log_a, Gaussian(x, P)
 
@@ -278,10 +282,10 @@ class Fuser:
         kept = take(picture, picture.status != DELETED)
         live = kept.times_ns < t_ns
         moving = take(kept, live)
-        factors, network_P = self._predict(moving, t_ns)
+        log_a, factors, network_P = self._predict(moving, t_ns)
         whitened = Whitened(factors.x, *whitener(factors.P))
-        product = multiply_mixtures(moving.log_a, whitened)
-        return Expected(picture, t_ns, kept, live, moving, factors, whitened, product, network_P)
+        product = multiply_mixtures(log_a, whitened)
+        return Expected(picture, t_ns, kept, live, moving, log_a, factors, whitened, product, network_P)
 
     def advance(self, expected: Expected, reports: Mapping[int, Heard]) -> tuple[Picture, list[Decision]]:
         """Work in all reports of one measurement time.
@@ -326,18 +330,22 @@ class Fuser:
             network_P=network_P,
         )
 
-    def _predict(self, picture: Picture, t_ns: int) -> tuple[Gaussian, Array]:
-        """Predict all factors as their nodes do (Eq. 5; ``dkf``: with one covariance for all)."""
+    def _predict(self, picture: Picture, t_ns: int) -> tuple[Array, Gaussian, Array]:
+        """Predict all factors and the weights of their terms as their nodes do (Eq. 5)."""
         dt: Array = (t_ns - picture.times_ns) / NS_PER_S
         dt = dt[0, ...] if len(dt) and (dt == dt[0]).all() else dt[:, None, None]
         factors = Gaussian(picture.x, picture.P)
+        if isinstance(self.motion, Imm):
+            dt = dt[..., 0] if dt.ndim else dt
+            modes = predict_modes(Modes(picture.log_a, factors), self.motion, dt, self.share.multiplicity)
+            return modes.log_mu, modes.densities, picture.network_P
         if not self.globalised:
-            return self.share.predict(factors, self.motion, dt), picture.network_P
+            return picture.log_a, self.share.predict(factors, self.motion, dt), picture.network_P
         common = globalise(picture.network_P)
         P = np.repeat(common.P[:, None, None], len(self.sensors), axis=1)
         x = np.matvec(common.G, factors.x[:, :, 0])[:, :, None]
         predicted = self.share.predict(Gaussian(x, P), self.motion, dt)
-        return predicted, predicted.P[:, :, 0]
+        return picture.log_a, predicted, predicted.P[:, :, 0]
 
     def _shrunk(self, network_P: Array, reports: Mapping[int, Heard]) -> Array:
         network_P = network_P.copy()
@@ -371,7 +379,7 @@ class Fuser:
 def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
     """Lay the reports over the predicted factors; tracks that a report or the picture lacks are left alone."""
     picture = expected.moving
-    who, log_p_bar, log_a = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy(), picture.log_a.copy()
+    who, log_p_bar, log_a = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy(), expected.log_a.copy()
     P, factors = expected.factors.P.copy(), Whitened(*(array.copy() for array in expected.whitened))
     for number, heard in reports.items():
         rows, others = _common(picture.ids, heard.report.ids)

@@ -14,6 +14,7 @@ import numpy as np
 from common.config import Scenario, SensorConfig, TargetConfig
 from common.errors import ConfigError
 from common.estimation.gaussian import Array
+from common.estimation.imm import draw_path
 from common.messages import IntArray, Scan
 from common.quantities import NS_PER_S
 
@@ -59,11 +60,8 @@ def _path(scenario: Scenario, target: TargetConfig, times_ns: IntArray, rng: np.
     motion = scenario.motion.build()
     path = np.full((len(times_ns), motion.n), np.nan)
     state, now_ns = _first_state(scenario, target, rng), scenario.to_ns(target.start)
-    for k in np.flatnonzero(times_ns >= now_ns):
-        dt = np.array((times_ns[k] - now_ns) / NS_PER_S)
-        noise = rng.multivariate_normal(np.zeros(motion.n), motion.noise(dt), method="svd")
-        state = motion.transition(dt) @ state + noise
-        path[k], now_ns = state, int(times_ns[k])
+    there = times_ns >= now_ns
+    path[there] = draw_path(motion, state, np.diff(times_ns[there], prepend=now_ns) / NS_PER_S, rng)
     return path
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.config import Scenario
-from common.estimation.association import Choice, Clutter, Expected, Plots, expect, update
-from common.estimation.gaussian import Array, Gaussian
+from common.estimation.association import Choice, Clutter, Expected, Plots, expect, weigh_and_absorb
+from common.estimation.gaussian import Array, Gaussian, log_sum_exp
+from common.estimation.imm import Imm, Modes, predict_modes
 from common.estimation.mixture import Mixture, Reduction, step, terms
 from common.estimation.motion import Motion
 from common.estimation.representation import Share
@@ -67,12 +68,24 @@ class LocalFilter:
     def start(self, prior: Gaussian) -> Mixture:
         """Tracks that start with ``prior``, shapes (T, n), (T, n, n)."""
         filters = [share.start(prior) for share in self.shares]
-        density = Gaussian(*(np.stack(arrays)[:, :, None] for arrays in zip(*filters, strict=True)))
-        zero = np.zeros((len(prior.x), 1))
-        return Mixture(zero, zero, density)
+        return self.spread(Gaussian(*(np.stack(arrays) for arrays in zip(*filters, strict=True))))
+
+    def spread(self, density: Gaussian, log_g: Array | None = None) -> Mixture:
+        """A mixture of one density, or, of several models, of the same for each.
+
+        Args:
+            density: of all filters, shapes (F, T, n), (F, T, n, n).
+            log_g: evidence so far, shape (T,); None: 0.
+        """
+        components = len(self.motion.models) if isinstance(self.motion, Imm) else 1
+        log_w = np.full((density.x.shape[1], components), -np.log(components))
+        several = Gaussian(*(np.repeat(part[:, :, None], components, axis=2) for part in density))
+        return Mixture(log_w, log_w if log_g is None else log_w + log_g[:, None], several)
 
     def predict(self, prior: Mixture, *intervals: Array) -> Mixture:
         """Predict all filters of all tracks (Eq. 5), each over its interval [s], shape () or (T,)."""
+        if isinstance(self.motion, Imm):
+            return self._predict_modes(self.motion, prior, intervals)
         filters = [
             share.predict(
                 Gaussian(prior.density.x[i], prior.density.P[i]), self.motion, dt[..., None] if dt.ndim else dt
@@ -80,6 +93,17 @@ class LocalFilter:
             for i, (share, dt) in enumerate(zip(self.shares, intervals, strict=False))
         ]
         return prior._replace(density=Gaussian(*(np.stack(arrays) for arrays in zip(*filters, strict=True))))
+
+    def _predict_modes(self, imm: Imm, prior: Mixture, intervals: tuple[Array, ...]) -> Mixture:
+        """Several models; each filter has its own weights, or the center could not predict the factor as its node."""
+        logs = (prior.log_g, prior.log_w) if self.tight else (prior.log_g,)
+        modes = [
+            predict_modes(Modes(log_mu, Gaussian(x, P)), imm, dt, share.multiplicity)
+            for log_mu, x, P, dt, share in zip(logs, *prior.density, intervals, self.shares, strict=False)
+        ]
+        density = Gaussian(*(np.stack(arrays) for arrays in zip(*(mode.densities for mode in modes), strict=True)))
+        log_w = modes[-1].log_mu
+        return Mixture(log_w - log_sum_exp(log_w)[:, None], modes[0].log_mu, density)
 
     def expect(self, density: Gaussian, sensor: Sensor, stand: Array, center: Array) -> Expected:
         """What a sensor will see of predicted tracks.
@@ -98,9 +122,14 @@ class LocalFilter:
         """Filter a scan, which all tracks share (z of shape (M, m)) or not (z of shape (T, 1, M, m))."""
         if self.choice is None:
             return step(predicted, expected, plots, self.reduction)
-        density, log_p_bar = update(expected, plots, self.choice)
-        return Mixture(predicted.log_w, predicted.log_g + log_p_bar, density)
+        density, log_p_bar, log_q_bar = weigh_and_absorb(expected, plots, self.choice)
+        if not isinstance(self.motion, Imm):
+            return Mixture(predicted.log_w, predicted.log_g + log_p_bar, density)
+        log_w = predicted.log_w + np.where(np.isfinite(log_q_bar), log_q_bar, 0.0)
+        return Mixture(log_w - log_sum_exp(log_w)[:, None], predicted.log_g + log_p_bar, density)
 
     def report(self, mixture: Mixture) -> Mixture:
         """The terms of a report."""
-        return mixture if self.choice is not None else terms(mixture, self.terms)
+        if self.choice is not None:
+            return mixture
+        return terms(mixture, self.terms)

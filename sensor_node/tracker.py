@@ -184,12 +184,10 @@ class LocalTracker:
 
     def initial(self) -> State:
         """A node that was told of no track yet."""
-        n = self.filter.motion.n
-        network = len(self.sensors) if self.schedule else 0
-        none, numbers = np.empty(0, np.int64), np.empty((0, 1))
-        x, P = np.empty((0, 1, n)), np.empty((0, 1, n, n))
-        tracks = Tracks(none, none, numbers, numbers, x, P, none, x, P, np.empty((0, network, n, n)))
-        return State(epoch=0, sequence=0, tracks=tracks, recent=())
+        n, none = self.filter.motion.n, np.empty(0, np.int64)
+        x, P = np.empty((0, n)), np.empty((0, n, n))
+        start = Start("", epoch=0, ids=none, times_ns=none, log_p_bar=np.empty(0), x=x, P=P, x_a=x, P_a=P)
+        return State(epoch=0, sequence=0, tracks=self._fresh(start), recent=())
 
     def prepare(self, state: State, time_ns: int, position: Array) -> State:
         """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
@@ -288,34 +286,28 @@ class LocalTracker:
         advice = sorted(past, key=lambda advice: advice.time_ns)[-1]  # of one time the one that came last
         tracks = state.tracks
         _, mine, given = np.intersect1d(tracks.ids, advice.ids, assume_unique=True, return_indices=True)
-        x_a, P_a, times = tracks.x_a.copy(), tracks.P_a.copy(), tracks.times_a_ns.copy()
-        x_a[mine, 0], P_a[mine, 0], times[mine] = advice.x[given], advice.P[given], advice.time_ns
+        log_w, x_a, P_a = tracks.log_w.copy(), tracks.x_a.copy(), tracks.P_a.copy()
+        times, honest = tracks.times_a_ns.copy(), self.filter.honest
+        times[mine] = advice.time_ns
+        # Of several models, the node's own opinion which one is in force stays.
+        _, _, ((x_a[mine],), (P_a[mine],)) = honest.start(Gaussian(advice.x[given], advice.P[given]))
         for look in state.recent:
             due = times < look.time_ns
             if due.any():
-                honest = self.filter.honest.start(Gaussian(x_a[due, 0], P_a[due, 0]))
-                predicted = self.filter.honest.predict(honest, _interval(times[due], look.time_ns))
-                expected = self._seen(self.filter.honest, predicted, look.position)
-                (x, P), times[due] = self.filter.honest.update(predicted, expected, look.plots).density, look.time_ns
-                x_a[due], P_a[due] = x[0], P[0]
-        return tracks._replace(x_a=x_a, P_a=P_a, times_a_ns=times)
+                prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
+                predicted = honest.predict(prior, _interval(times[due], look.time_ns))
+                expected = self._seen(honest, predicted, look.position)
+                log_w[due], _, ((x_a[due],), (P_a[due],)) = honest.update(predicted, expected, look.plots)
+                times[due] = look.time_ns
+        return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times)
 
     def _fresh(self, start: Start) -> Tracks:
         """Tracks as they are told of."""
         network = len(self.sensors) if self.schedule else 0
-        zero = np.zeros((len(start.ids), 1))
-        return Tracks(
-            start.ids,
-            start.times_ns,
-            zero,
-            zero + start.log_p_bar[:, None],
-            start.x[:, None],
-            start.P[:, None],
-            start.times_ns,
-            start.x_a[:, None],
-            start.P_a[:, None],
-            np.repeat(start.P[:, None], network, axis=1),
-        )
+        both = Gaussian(np.stack([start.x, start.x_a]), np.stack([start.P, start.P_a]))
+        log_w, log_g, (x, P) = self.filter.spread(both, start.log_p_bar)
+        network_P = np.repeat(start.P[:, None], network, axis=1)
+        return Tracks(start.ids, start.times_ns, log_w, log_g, x[0], P[0], start.times_ns, x[1], P[1], network_P)
 
     def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Mixture, Expected]:
         """Predict to a time, and what the sensor will see from a position then."""

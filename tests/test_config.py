@@ -184,7 +184,15 @@ FAULTS = [
     ("psd = 10.0\n", "", "motion.psd: is missing"),
     ("psd = 10.0", "psd = -1", "motion.psd: -1 is not zero or positive and finite"),
     ("psd = 10.0", "psd = nan", "motion.psd: nan is not zero or positive and finite"),
-    ('model = "cv"', 'model = "ca"', "motion.model: 'ca' is not one of 'cv'"),
+    ('model = "cv"', 'model = "cx"', "motion.model: 'cx' is not one of 'cv', 'ca', 'ct' or 'imm'"),
+    ('model = "cv"', 'model = "ct"', "motion.turn_rate: is missing"),
+    ("psd = 10.0", "psd = 10.0\nturn_rate = 0.1", "motion.turn_rate: is of model = 'ct', not of 'cv'"),
+    ("psd = 10.0", "psd = 10.0\nsojourn = 30.0", "motion.sojourn: is of model = 'imm', not of 'cv'"),
+    (
+        "psd = 10.0",
+        "psd = 10.0\nmodels = [{ psd = 1.0 }, { psd = 2.0 }]",
+        "motion.models: is of model = 'imm', not of 'cv'",
+    ),
     ("dimensions = 2", "dimensions = 4", "motion.dimensions: 4 is not one of 2 or 3"),
     # decision
     ("p0 = 1e-3", "p0 = 0", "decision.p0: 0 is not a probability strictly between 0 and 1"),
@@ -280,7 +288,7 @@ FAULTS = [
     (
         "state = [0.0, 0.0, 150.0, 0.0]\n\n",
         "state = [0.0, 0.0, 150.0]\n\n",
-        "target.0.state: has 3 numbers, this scenario's dimensions need 4",
+        "target.0.state: has 3 numbers, this scenario's dimensions and motion need 4",
     ),
     (
         "hypothesis = 0",
@@ -292,7 +300,7 @@ FAULTS = [
     (
         "sigma = [100.0, 90.0, 20.0, 10.0]",
         "sigma = [100.0, 90.0, 20.0]",
-        "hypothesis.0.sigma: has 3 numbers, this scenario's dimensions need 4",
+        "hypothesis.0.sigma: has 3 numbers, this scenario's dimensions and motion need 4",
     ),
     (
         "sigma = [100.0, 90.0, 20.0, 10.0]",
@@ -329,9 +337,9 @@ def test_three_dimensions_need_longer_lists(tmp_path: Path) -> None:
         "sensor.0.field_of_view.center: has 2 numbers, this scenario's dimensions need 3",
         "sensor.1.sigma: has 2 numbers, this scenario's dimensions need 3",
         "sensor.2.sigma: has 2 numbers, this scenario's dimensions need 3",
-        "hypothesis.0.state: has 4 numbers, this scenario's dimensions need 6",
-        "hypothesis.0.sigma: has 4 numbers, this scenario's dimensions need 6",
-        "target.0.state: has 4 numbers, this scenario's dimensions need 6",
+        "hypothesis.0.state: has 4 numbers, this scenario's dimensions and motion need 6",
+        "hypothesis.0.sigma: has 4 numbers, this scenario's dimensions and motion need 6",
+        "target.0.state: has 4 numbers, this scenario's dimensions and motion need 6",
     ]
 
 

@@ -259,7 +259,7 @@ class Scenario(_Model):
     @property
     def share(self) -> Share:
         """A sensor's share of prior and process noise."""
-        return Share(1.0 if self.fusion.mode == "naive" else float(len(self.sensors)))
+        return Share(1.0 if self.fusion.mode in ("naive", "selected") else float(len(self.sensors)))
 
 
 def load_scenario(path: Path) -> Scenario:

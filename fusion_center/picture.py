@@ -10,7 +10,7 @@ import numpy as np
 
 from common.config import Scenario
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, log_sum_exp, whitener
+from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, log_sum_exp, moments, whitener
 from common.estimation.imm import Imm, Modes, predict_modes
 from common.estimation.mixture_product import multiply_mixtures
 from common.estimation.motion import Motion
@@ -18,8 +18,11 @@ from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import DELETED, TENTATIVE, StatusArray, Thresholds, decide
-from common.messages import Decision, IntArray, Rebase, Report
+from common.messages import Decision, IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
+
+#: No position or speed in m, m/s is larger, and no standard deviation smaller than its inverse.
+_LARGEST = 1e15
 
 
 class Picture(NamedTuple):
@@ -102,6 +105,24 @@ class Heard(NamedTuple):
         log_a = np.where(possible, log_g, np.where(there, 0.0, -np.inf)) - np.where(possible, log_p_bar[:, None], 0.0)
         log_a -= log_sum_exp(log_a)[:, None]
         return cls(report, log_p_bar, log_a, report.P[which], Whitened(*(part[which] for part in factors)))
+
+
+class Backup(NamedTuple):
+    """What a node goes on from, one row a track of the picture.
+
+    Attributes:
+        times_ns: of the densities, shape (T,).
+        log_p_bar: cumulative so far, shape (T,).
+        x, P: factors, shapes (T, n), (T, n, n).
+        x_a, P_a: association filters, same shapes.
+    """
+
+    times_ns: IntArray
+    log_p_bar: Array
+    x: Array
+    P: Array
+    x_a: Array
+    P_a: Array
 
 
 class Expected(NamedTuple):
@@ -208,6 +229,37 @@ class Fuser:
             network_P=np.empty((0, n_sensors if self.globalised else 0, n, n)),
         )
 
+    def heard(self, report: Report | Picked) -> Heard | None:
+        """A report taken apart, if it can be computed with."""
+        if not isinstance(report, Report) or report.x.shape[-1] != self.motion.n or (report.terms > self.terms).any():
+            return None
+        # Positive definite, and far from where squares overflow.
+        variances = report.P.diagonal(axis1=-2, axis2=-1)
+        if (np.abs(report.x) > _LARGEST).any() or (variances > _LARGEST**2).any() or (variances < _LARGEST**-2).any():
+            return None
+        try:
+            return Heard.of(report)
+        except np.linalg.LinAlgError:
+            return None
+
+    def backup(self, picture: Picture, number: int) -> Backup:
+        """What a sensor that joins goes on from: its last factor where it reported one, else the prior.
+
+        A report is the whole state of a factor, so the center is every node's backup.
+        """
+        held = picture.reported[:, number]
+        prior = self.share.start(Gaussian(picture.x0, picture.P0))
+        # Which of its hypotheses a node held for true it has not said: the terms' own weights must do.
+        last = moments(np.exp(picture.log_a[:, number]), Gaussian(picture.x[:, number], picture.P[:, number]))
+        return Backup(
+            times_ns=np.where(held, picture.times_ns, picture.starts_ns),
+            log_p_bar=picture.log_p_bar[:, number],
+            x=np.where(held[:, None], last.x, prior.x),
+            P=np.where(held[:, None, None], last.P, prior.P),
+            x_a=np.where(held[:, None], picture.fused_x, picture.x0),
+            P_a=np.where(held[:, None, None], picture.fused_P, picture.P0),
+        )
+
     def begin(self, picture: Picture, ids: IntArray, times_ns: IntArray, priors: Gaussian) -> Picture:
         """Add tracks that start with ``priors``, shapes (T, n), (T, n, n)."""
         tracks, n_sensors = len(ids), len(self.sensors)
@@ -248,8 +300,8 @@ class Fuser:
         Returns:
             the picture, its rebased tracks at the time of the rebase.
         """
-        rows, given = _common(now.ids, told.ids)
-        old, _ = _common(then.ids, now.ids[rows])
+        rows, given = common(now.ids, told.ids)
+        old, _ = common(then.ids, now.ids[rows])
         assert len(then.ids[old]) == len(now.ids[rows]), "a track that was told of was there"
         log_a, (x, P) = self._shares(Gaussian(told.x[given], told.P[given]))
         part = take(now, rows) if not isinstance(rows, slice) else now
@@ -300,7 +352,7 @@ class Fuser:
             the picture at the measurement time and what was decided.
         """
         moved = self._move(expected, reports)
-        moved, decisions = self._decide(moved)
+        moved, decisions = decided(moved, self.limits)
         return (moved if expected.live.all() else put(expected.kept, expected.live, moved)), decisions
 
     def _move(self, expected: Expected, reports: Mapping[int, Heard]) -> Picture:
@@ -357,23 +409,25 @@ class Fuser:
             network_P[:, number] = shrink(P, linear.H, linear.R)
         return network_P
 
-    def _decide(self, picture: Picture) -> tuple[Picture, list[Decision]]:
-        if self.limits is None:
-            return picture, []
-        verdict = decide(picture.log_lr, picture.status, self.limits)
-        # Confirmed anew, a track only has its LR reset: that is monitoring, not a decision.
-        decisions = [
-            Decision(
-                kind="deleted" if verdict.rejected[row] else "confirmed",
-                track=int(picture.ids[row]),
-                time_ns=int(picture.times_ns[row]),
-                log_lr=float(picture.log_lr[row]),
-                log_lr_total=float(picture.log_lr_total[row]),
-                scans=int(picture.scans[row]),
-            )
-            for row in np.nonzero(verdict.status != picture.status)[0]
-        ]
-        return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
+
+def decided(picture: Picture, limits: Thresholds | None) -> tuple[Picture, list[Decision]]:
+    """The picture after the test of every track, and what was decided; without limits nothing is."""
+    if limits is None:
+        return picture, []
+    verdict = decide(picture.log_lr, picture.status, limits)
+    # Confirmed anew, a track only has its LR reset: that is monitoring, not a decision.
+    decisions = [
+        Decision(
+            kind="deleted" if verdict.rejected[row] else "confirmed",
+            track=int(picture.ids[row]),
+            time_ns=int(picture.times_ns[row]),
+            log_lr=float(picture.log_lr[row]),
+            log_lr_total=float(picture.log_lr_total[row]),
+            scans=int(picture.scans[row]),
+        )
+        for row in np.nonzero(verdict.status != picture.status)[0]
+    ]
+    return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
 
 
 def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
@@ -382,7 +436,7 @@ def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
     who, log_p_bar, log_a = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy(), expected.log_a.copy()
     P, factors = expected.factors.P.copy(), Whitened(*(array.copy() for array in expected.whitened))
     for number, heard in reports.items():
-        rows, others = _common(picture.ids, heard.report.ids)
+        rows, others = common(picture.ids, heard.report.ids)
         who[rows, number] = True
         log_p_bar[rows, number] = heard.log_p_bar[others]
         size = heard.log_a.shape[1]
@@ -393,7 +447,7 @@ def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
     return Reported(who, log_p_bar, log_a, P, factors)
 
 
-def _common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:
+def common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:
     """Where ids that both have stand in each; mostly both have the same."""
     if ours.tobytes() == theirs.tobytes():
         return slice(None), slice(None)

@@ -19,10 +19,11 @@ from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, BoolArray, Gaussian
 from common.estimation.mixture import Mixture
 from common.estimation.representation import globalise, shrink
+from common.estimation.selection import Selection, select
 from common.estimation.sensing import Sensor
-from common.messages import Advice, IntArray, Rebase, Report, Scan, Start, Stop
+from common.local_filter import LocalFilter
+from common.messages import Advice, IntArray, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
-from sensor_node.local_filter import LocalFilter
 
 
 class Tracks(NamedTuple):
@@ -139,6 +140,7 @@ class LocalTracker:
         filter: predicts and filters the tracks.
         feedback: the fused track comes back, as advice or to begin anew (theory.md §3, 6).
         rounded: reports are in single precision.
+        selection: which plots are sent, where the center tracks; else None.
         digest: of what the center must have in common with this node.
         buffer_ns: how long scans are kept.
         schedule: scan times of the network, only for ``dkf``.
@@ -151,6 +153,7 @@ class LocalTracker:
     filter: LocalFilter
     feedback: bool
     rounded: bool
+    selection: Selection | None
     digest: str
     buffer_ns: int
     schedule: Schedule | None
@@ -177,6 +180,7 @@ class LocalTracker:
             filter=LocalFilter.of(scenario),
             feedback=scenario.fusion.feedback != "none",
             rounded=scenario.fusion.precision == "float32",
+            selection=scenario.fusion.selection.build() if scenario.fusion.mode == "selected" else None,
             digest=scenario.digest,
             buffer_ns=round(scenario.fusion.window * NS_PER_S),
             schedule=schedule if scenario.fusion.mode == "dkf" else None,
@@ -193,11 +197,11 @@ class LocalTracker:
         """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
         return state._replace(ready=self._ready(state, time_ns, position))
 
-    def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report]:
+    def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report | Picked]:
         """Filter one scan and report every track that started before it."""
         return self.look(state, Look(scan.time_ns, scan.position, Plots(scan.z)), next_ns)
 
-    def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report]:
+    def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""
         ready = self._ready(state, look.time_ns, look.position)
         mixture = self.filter.update(ready.mixture, ready.expected, look.plots)
@@ -205,10 +209,39 @@ class LocalTracker:
         tracks = filtered if ready.live.all() else _put(ready.advised, ready.live, filtered)
         advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
         kept = tuple(old for old in state.recent if old.time_ns >= look.time_ns - self.buffer_ns)
-        report = self._report(state, look.time_ns, next_ns, filtered.ids, self.filter.report(mixture))
+        if self.selection is None:
+            report: Report | Picked = self._report(state, look.time_ns, next_ns, filtered.ids, mixture)
+        else:
+            report = self._picked(state, look, next_ns, ready, self.selection)
         return State(state.epoch, state.sequence + 1, tracks, (*kept, look), advice), report
 
-    def _report(self, state: State, time_ns: int, next_ns: int, ids: IntArray, mixture: Mixture) -> Report:
+    def _picked(self, state: State, look: Look, next_ns: int, ready: Ready, selection: Selection) -> Picked:
+        plots = look.plots
+        mine = select(ready.mixture.log_w, ready.expected, plots, selection)
+        track, plot = np.nonzero(mine)
+        z, which = plots.z, np.arange(len(track))
+        if z.ndim == 2:
+            used = mine.any(axis=0)
+            z, which = z[used], (np.cumsum(used) - 1)[plot]
+        else:
+            z = z[track, 0, plot]
+        if self.rounded:
+            z = z.astype(np.float32).astype(np.float64)
+        return Picked(
+            sensor=self.config.name,
+            sequence=state.sequence,
+            time_ns=look.time_ns,
+            next_ns=next_ns,
+            epoch=state.epoch,
+            position=look.position,
+            ids=ready.predicted.ids,
+            plots=mine.sum(axis=-1),
+            which=which,
+            z=z,
+        )
+
+    def _report(self, state: State, time_ns: int, next_ns: int, ids: IntArray, filtered: Mixture) -> Report:
+        mixture = self.filter.report(filtered)
         there = mixture.log_w > -np.inf
         x, P = (array[0][there] for array in mixture.density)
         if self.rounded:

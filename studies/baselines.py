@@ -11,9 +11,9 @@ from common.config import Scenario
 from common.estimation.association import Plots
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp, moments
 from common.estimation.mixture import Mixture
+from common.local_filter import HONEST, LocalFilter
 from common.messages import Decision, Scan
 from common.quantities import NS_PER_S
-from sensor_node.local_filter import HONEST, LocalFilter
 from studies.course import Course, Look, Worlds
 from studies.worlds import studied
 

@@ -48,7 +48,7 @@ class LocalFilter:
         return cls(
             motion=scenario.motion.build(),
             share=share or scenario.share,
-            tight=share is None and fusion.association != "factor",
+            tight=share is None and fusion.mode != "selected" and fusion.association != "factor",
             choice=fusion.choice,
             reduction=fusion.mixture.build(),
             terms=fusion.terms,

@@ -76,7 +76,7 @@ class Store:
     def load(self, job: Job, mode: str) -> Result | None:
         """A finished part; None when it is missing, damaged, or of something else."""
         try:
-            with np.load(self._path(job, mode), allow_pickle=False) as part:
+            with np.load(io.BytesIO(self._path(job, mode).read_bytes()), allow_pickle=False) as part:
                 if str(part["digest"]) != part_digest(job, mode):
                     return None
                 local = part.get("local_log_lr")

@@ -95,8 +95,9 @@ SHEETS = (
     Sheet(
         "calibration",
         "Calibration",
-        "Share of the runs without a target in which the LR reached B before the scenario's end, with Clopper-Pearson "
-        "bounds of 95 %. For an exact LR the probability is at most 1/B (Ville). Shares of 0 are not shown.",
+        "Share of the runs without a target in which the LR reached B before the scenario's end; shaded: "
+        "Clopper-Pearson bounds of 95 %. For an exact LR the probability is at most 1/B (Ville), the grey line: a band "
+        "that is all above it tells of an LR that is too sure.",
         draw_calibration,
         needs=False,
     ),

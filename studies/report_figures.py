@@ -12,13 +12,15 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from common.estimation.gaussian import Array
 from common.estimation.sprt import Thresholds
-from studies.report_style import FAINT, QUIET, legend, line, look
+from studies.report_style import QUIET, legend, line, look
 from studies.study import Outcome
 from studies.tables import Table, rows_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+#: Panels beside each other where each mode has its own.
+_BESIDE = 5
 _THRESHOLD = {"color": QUIET, "lw": 1.0, "ls": (0, (2, 2)), "zorder": 1}
 
 
@@ -238,26 +240,32 @@ def _draw_over_scans(axes: Axes, scene: Scene, variant: str, column: str) -> flo
 
 
 def draw_calibration(scene: Scene) -> Figure:
-    """How often the LR of nothing reaches B, and 1/B, which an exact LR never exceeds."""
+    """How often the LR of nothing reaches B, and 1/B, which an exact LR never exceeds: a panel for each mode."""
     names = [name for name, has_target in scene.variants.items() if not has_target]
-    figure, axes = panels(1, len(names), 5.0, sharey=True)
-    for panel, variant in zip(axes[0], names, strict=True):
+    rows_each = -(-len(scene.modes) // _BESIDE)
+    figure, axes = panels(rows_each * len(names), _BESIDE, 2.3, sharex=True, sharey=True)
+    for variant, block in zip(names, np.split(axes, len(names)), strict=True):
         table = rows_of(scene.outcome.calibration, variant=variant, method="direct")
-        panel.fill_between(table["b"], table["bound"], 1.2, color=FAINT, alpha=0.5, lw=0)
-        panel.plot(np.unique(table["b"]), 1.0 / np.unique(table["b"]), **{**_THRESHOLD, "ls": "-", "lw": 1.4})
-        for number, mode in enumerate(scene.modes):
-            _draw_share(panel, rows_of(table, mode=mode), mode, 1.0 + 0.012 * (number - len(scene.modes) / 2))
-        lowest = _positive(table["share"])
-        floor = 0.3 * float(np.nanmin(lowest)) if np.isfinite(lowest).any() else 1e-4
-        panel.set(xscale="log", yscale="log", xlabel="B", ylim=(floor, 1.2))
-        panel.set(title=f"{variant}: P(sup LR ≥ B), {int(table['runs'][0])} runs")
-        panel.annotate("above 1/B: too sure", (0.97, 0.94), xycoords="axes fraction", ha="right", color=QUIET)
-    legend(figure, scene.modes, markers=True)
+        floor = 0.3 / int(table["runs"][0])
+        for number, panel in enumerate(block.ravel()):
+            if number >= len(scene.modes):
+                panel.set_axis_off()
+                continue
+            mode = scene.modes[number]
+            _draw_share(panel, rows_of(table, mode=mode), mode, floor)
+            panel.set(title=f"{variant}: {mode}" if number == 0 and len(names) > 1 else mode, ylim=(floor, 1.2))
+            if number + _BESIDE >= len(scene.modes):
+                panel.set_xlabel("B")
+                panel.tick_params(labelbottom=True)
+        for panel in block[:, 0]:
+            panel.set_ylabel("P(sup LR ≥ B)")
     return figure
 
 
-def _draw_share(axes: Axes, rows: Table, mode: str, shift: float) -> None:
-    drawn, share = look(mode), _positive(rows["share"])
-    bounds = (share - rows["low"], rows["high"] - share)
-    dots: dict[str, Any] = {"marker": drawn.marker, "ms": 4, "elinewidth": 0.7, "lw": 1.2}
-    axes.errorbar(shift * rows["b"], share, yerr=bounds, color=drawn.colour, ls=drawn.line, **dots)
+def _draw_share(axes: Axes, rows: Table, mode: str, floor: float) -> None:
+    drawn = look(mode)
+    axes.set(xscale="log", yscale="log")
+    axes.plot(rows["b"], rows["bound"], color=QUIET, lw=1.2)
+    bounds = np.maximum(rows["low"], floor), rows["high"]
+    axes.fill_between(rows["b"], *bounds, color=drawn.colour, alpha=0.22, lw=0)
+    axes.plot(rows["b"], _positive(rows["share"]), color=drawn.colour, marker=drawn.marker, ms=0.7 * drawn.size)

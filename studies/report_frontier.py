@@ -46,9 +46,8 @@ def draw_frontier(scene: Scene) -> Figure:
     for row, variant in zip(axes, scene.with_target, strict=True):
         summary = rows_of(scene.outcome.summary, variant=variant)
         for panel, measure in zip(row, _measures(summary), strict=True):
-            first = panel is row[0]
-            panel.set(title=f"{variant}: {measure.title}" if first else measure.title)
-            panel.set(xlabel=f"bytes per track and scan; {measure.better} is better")
+            title = f"{measure.title}; {measure.better} is better"
+            panel.set(title=f"{variant}: {title}" if panel is row[0] else title, xlabel="bytes per track and scan")
             if measure.share:
                 panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=None))
             _scatter(panel, summary, measure, 72.0 * height - _AROUND)
@@ -58,11 +57,11 @@ def draw_frontier(scene: Scene) -> Figure:
 def _measures(summary: Table) -> list[Measure]:
     log_lr, is_reference = summary["log_lr_mean"], summary["mode"] == _REFERENCE
     if is_reference.any() and float(log_lr[is_reference][0]) > 0.0:
-        evidence = Measure("mean log LR, of centralised", "higher", log_lr / log_lr[is_reference][0], share=True)
+        evidence = Measure("log LR, % of centralised", "higher", log_lr / log_lr[is_reference][0], share=True)
     else:
         evidence = Measure("mean log LR", "higher", log_lr)
     return [
-        Measure("mean scans to decide", "lower", summary["decision_scans_mean"]),
+        Measure("scans to decide", "lower", summary["decision_scans_mean"]),
         Measure("tracks lost", "lower", summary["share_lost"], share=True),
         evidence,
     ]
@@ -102,7 +101,15 @@ def _name(axes: Axes, modes: Any, x: Array, y: Array, height: float) -> None:
             va="center",
             fontsize=8.5,
             color=look(modes[number]).colour,
-            arrowprops={"arrowstyle": "-", "color": QUIET, "lw": 0.5, "alpha": 0.6, "shrinkA": 1, "shrinkB": 4},
+            arrowprops={
+                "arrowstyle": "-",
+                "color": QUIET,
+                "lw": 0.5,
+                "alpha": 0.6,
+                "shrinkA": 1,
+                "shrinkB": 4,
+                "relpos": (0, 0.5),
+            },
         )
 
 

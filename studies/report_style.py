@@ -89,11 +89,10 @@ def line(axes: Axes, mode: str, x: Any, y: Any, **style: Any) -> None:
     axes.plot(x, y, color=drawn.colour, ls=drawn.line, **style)
 
 
-def legend(figure: Figure, modes: Sequence[str], *, markers: bool = False) -> None:
+def legend(figure: Figure, modes: Sequence[str]) -> None:
     """All modes beside the panels, where they hide no data."""
     handles = []
     for mode in modes:
         drawn = look(mode)
-        marker = drawn.marker if markers else None
-        handles.append(Line2D([], [], color=drawn.colour, ls=drawn.line, marker=marker, ms=5, label=mode))
+        handles.append(Line2D([], [], color=drawn.colour, ls=drawn.line, label=mode))
     figure.legend(handles=handles, loc="outside right upper")

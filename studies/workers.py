@@ -97,7 +97,9 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Parts:
     with _environment(_ONE_THREAD):
         pool = ProcessPoolExecutor(min(workers, len(jobs)), context, _begin)
         try:
-            for future in as_completed([pool.submit(_all_of, job) for job in jobs]):
+            with _deaf_to_ctrl_c():
+                futures = [pool.submit(_all_of, job) for job in jobs]
+            for future in as_completed(futures):
                 yield from future.result()
         except BrokenProcessPool:
             raise StudyError(
@@ -111,9 +113,18 @@ def _in_processes(jobs: Sequence[Job], workers: int) -> Parts:
             pool.shutdown(cancel_futures=True)
 
 
+@contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Workers that are started here never hear of Ctrl-C, not even while they begin; this process hears of it after."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
 def _begin() -> None:
-    """A worker leaves Ctrl-C to the process that started it, and ends when that is gone, however it went."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """A worker ends when the process that started it is gone, however it went."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 

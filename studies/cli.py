@@ -71,7 +71,7 @@ def study(
     folder = out or Path("runs") / f"study-{loaded.name}"
     opened = Study(loaded, order, folder, fresh=fresh)
     _follow(opened, workers, scheduler, Console(stderr=True, highlight=False))
-    _finish(opened, Console(highlight=False))
+    _finish(opened, Console(stderr=True, highlight=False), Console(highlight=False))
 
 
 def _follow(opened: Study, workers: int, scheduler: str | None, console: Any) -> None:
@@ -90,13 +90,14 @@ def _follow(opened: Study, workers: int, scheduler: str | None, console: Any) ->
         raise
 
 
-def _finish(opened: Study, console: Any) -> None:
+def _finish(opened: Study, aside: Any, console: Any) -> None:
     from studies.progress import show
     from studies.report import write_report
 
-    outcome = opened.judge()
-    files = opened.write(outcome)
-    files.append(write_report(opened, outcome, sys.argv[1:]))
+    with aside.status("tables and report"):
+        outcome = opened.judge()
+        files = opened.write(outcome)
+        files.append(write_report(opened, outcome, sys.argv[1:]))
     show(console, outcome.summary, files)
 
 

@@ -200,7 +200,11 @@ def _draw(sheet: Sheet, scene: Scene, folder: Path) -> str:
     # The salt keeps identifiers apart that figures of one page would share, and makes them the same every time.
     with mpl.rc_context({**SETTINGS, "svg.hashsalt": sheet.name}):
         drawn = sheet.draw(scene)
+        for axes in drawn.axes:
+            axes.minorticks_off()
         drawn.savefig(folder / f"{sheet.name}.png", dpi=110)
+        # Laying out takes most of the time and would come out the same.
+        drawn.set_layout_engine("none")
         drawn.savefig(svg, format="svg", metadata={"Date": None})
     write_atomically(folder / f"{sheet.name}.svg", svg.getvalue().encode())
     return svg.getvalue()[svg.getvalue().index("<svg") :]

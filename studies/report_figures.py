@@ -91,8 +91,9 @@ def _zoom(axes: Axes, scene: Scene, variant: str) -> None:
     axes.set(xlim=(0, max(4, last)), ylim=(2.0 * log_a, 1.5 * log_b))
     for value, name, align in ((log_b, "log B: confirm", "bottom"), (log_a, "log A: delete", "top")):
         at: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points"}
-        shift = (0, 2 if align == "bottom" else -2)
-        axes.annotate(name, (1, value), xytext=shift, ha="right", va=align, color=QUIET, fontsize=8.5, **at)
+        shift = (-3, 4 if align == "bottom" else -4)
+        behind = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85}
+        axes.annotate(name, (1, value), shift, ha="right", va=align, color=QUIET, fontsize=8.5, bbox=behind, **at)
 
 
 def draw_decided(scene: Scene) -> Figure:

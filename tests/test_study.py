@@ -284,7 +284,7 @@ def test_the_tables_are_the_same_on_a_cluster(tmp_path: Path, real: Order) -> No
     here.play(1, None, lambda _: None)
     there = Study(PLOT, real, tmp_path / "there")
     with LocalCluster(
-        n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None, host="127.0.0.1"
+        n_workers=1, threads_per_worker=2, processes=False, protocol="tcp", dashboard_address=None
     ) as cluster:
         there.play(1, cluster.scheduler_address, lambda _: None)
     assert tables_of(here) == tables_of(there)

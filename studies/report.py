@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from html import escape
@@ -197,17 +198,26 @@ def _draw(sheet: Sheet, scene: Scene, folder: Path) -> str:
         the SVG element.
     """
     svg = io.StringIO()
-    # The salt keeps identifiers apart that figures of one page would share, and makes them the same every time.
+    # With a salt, the names of parts are the same every time.
     with mpl.rc_context({**SETTINGS, "svg.hashsalt": sheet.name}):
         drawn = sheet.draw(scene)
         for axes in drawn.axes:
             axes.minorticks_off()
+        _lay_out(drawn)
         drawn.savefig(folder / f"{sheet.name}.png", dpi=110)
-        # Laying out takes most of the time and would come out the same.
-        drawn.set_layout_engine("none")
         drawn.savefig(svg, format="svg", metadata={"Date": None})
-    write_atomically(folder / f"{sheet.name}.svg", svg.getvalue().encode())
-    return svg.getvalue()[svg.getvalue().index("<svg") :]
+    text = svg.getvalue()
+    write_atomically(folder / f"{sheet.name}.svg", text.encode())
+    # Figures of one page must not share names of parts.
+    return re.sub(r'(\bid="|href="#|url\(#)', rf"\g<1>{sheet.name}-", text[text.index("<svg") :])
+
+
+def _lay_out(figure: Figure) -> None:
+    """Once: it takes most of the time, and every drawing would do it twice."""
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
+    figure.set_layout_engine("none")
 
 
 def _head(study: Study, command: Sequence[str]) -> Iterator[str]:

@@ -129,7 +129,9 @@ def draw_overview(scene: Scene) -> Figure:
             panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=None))
         row[1].set_xlim(-0.02, 1.02)
         row[2].set_xlim(0, max(0.02, row[2].get_xlim()[1]))
-        row[3].set(title="sent per track and scan", xlabel="bytes, up and down", xscale="log")
+        row[3].set(title="sent per track and scan", xlabel="bytes, up and down")
+        if (summary["bytes_per_track_scan"] > 0.0).any():
+            row[3].set_xscale("log")
         if not scene.variants[variant]:
             row[2].set_axis_off()
             row[2].set_title("")

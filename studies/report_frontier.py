@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, PercentFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, PercentFormatter
 
 from common.estimation.gaussian import Array
 from studies.report_figures import Scene, panels
@@ -41,7 +41,7 @@ class Measure(NamedTuple):
 
 def draw_frontier(scene: Scene) -> Figure:
     """Decision length, tracks lost, and log LR relative to all plots at the center, over bytes per track and scan."""
-    height = 1.3 + 0.27 * len(scene.modes)
+    height = max(2.8, 1.3 + 0.27 * len(scene.modes))
     figure, axes = panels(len(scene.with_target), 3, height)
     for row, variant in zip(axes, scene.with_target, strict=True):
         summary = rows_of(scene.outcome.summary, variant=variant)
@@ -71,19 +71,21 @@ def _scatter(axes: Axes, summary: Table, measure: Measure, height: float) -> Non
     """Markers, and names beside the panel, moved apart where they would cover each other."""
     sent = summary["bytes_per_track_scan"]
     shown = np.isfinite(measure.values) & (sent > 0.0)
-    axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     if not shown.any():
         return
+    axes.set_xscale("log")
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     modes, x, y = summary["mode"][shown], sent[shown], measure.values[shown]
     for mode, at, value in zip(modes, x, y, strict=True):
         drawn = look(mode)
         axes.plot(
             at, value, marker=drawn.marker, color=drawn.colour, ms=drawn.size * 1.3, mec="white", mew=0.6, zorder=3
         )
-    spread = max(float(np.ptp(y)), 0.02 if measure.share else 0.1)
-    axes.set_ylim(y.min() - 0.12 * spread, y.max() + 0.12 * spread)
+    spread = max(float(np.ptp(y)), 0.05 if measure.share else 1.0)
+    axes.set_ylim(y.min() - (0.12 if y.min() else 0.05) * spread, y.max() + 0.12 * spread)
     axes.set_xlim(x.min() / 1.8, x.max() * 1.8)
+    if x.max() < 30.0 * x.min():
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     _name(axes, modes, x, y, height)
 
 

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 
 from common.estimation.gaussian import Array
 from common.estimation.sprt import Thresholds
-from studies.report_style import QUIET, legend, line, look
+from studies.report_style import QUIET, bytes_axis, legend, line, look
 from studies.study import Outcome
 from studies.tables import Table, rows_of
 
@@ -122,16 +122,20 @@ def draw_overview(scene: Scene) -> Figure:
         for at, mode in enumerate(summary["mode"]):
             _overview_line(row, at, {name: column[at] for name, column in summary.items()}, look(mode))
         row[0].set(yticks=range(len(scene.modes)), yticklabels=scene.modes, ylim=(len(scene.modes) - 0.5, -0.5))
-        row[0].set(title=f"{variant}: scans to decide", xlabel="q10 to q90, | median, mean", xlim=(0, None))
+        row[0].set(
+            title=f"{variant}: scans to decide",
+            xlabel="q10 to q90, | median, mean",
+            xlim=(0, 1.04 * row[0].get_xlim()[1]),
+        )
         row[0].xaxis.set_major_locator(MaxNLocator(integer=True))
         for panel, title in zip(row[1:3], ("confirmed", "lost"), strict=True):
             panel.set(title=title, xlabel="share of runs, 95 % bounds")
             panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=None))
         row[1].set_xlim(-0.02, 1.02)
-        row[2].set_xlim(0, max(0.02, row[2].get_xlim()[1]))
+        right = max(0.02, row[2].get_xlim()[1])
+        row[2].set_xlim(-0.02 * right, right)
         row[3].set(title="sent per track and scan", xlabel="bytes, up and down")
-        if (summary["bytes_per_track_scan"] > 0.0).any():
-            row[3].set_xscale("log")
+        bytes_axis(row[3], summary["bytes_per_track_scan"])
         if not scene.variants[variant]:
             row[2].set_axis_off()
             row[2].set_title("")
@@ -245,8 +249,9 @@ def _draw_over_scans(axes: Axes, scene: Scene, variant: str, column: str) -> flo
 def draw_calibration(scene: Scene) -> Figure:
     """How often the LR of nothing reaches B, and 1/B, which an exact LR never exceeds: a panel for each mode."""
     names = [name for name, has_target in scene.variants.items() if not has_target]
-    rows_each = -(-len(scene.modes) // _BESIDE)
-    figure, axes = panels(rows_each * len(names), _BESIDE, 2.3, sharex=True, sharey=True)
+    columns = min(_BESIDE, len(scene.modes))
+    rows_each = -(-len(scene.modes) // columns)
+    figure, axes = panels(rows_each * len(names), columns, 2.3, sharex=True, sharey=True)
     for variant, block in zip(names, np.split(axes, len(names)), strict=True):
         table = rows_of(scene.outcome.calibration, variant=variant, method="direct")
         floor = 0.3 / int(table["runs"][0])
@@ -257,7 +262,7 @@ def draw_calibration(scene: Scene) -> Figure:
             mode = scene.modes[number]
             _draw_share(panel, rows_of(table, mode=mode), mode, floor)
             panel.set(title=f"{variant}: {mode}" if number == 0 and len(names) > 1 else mode, ylim=(floor, 1.2))
-            if number + _BESIDE >= len(scene.modes):
+            if number + columns >= len(scene.modes):
                 panel.set_xlabel("B")
                 panel.tick_params(labelbottom=True)
         for panel in block[:, 0]:

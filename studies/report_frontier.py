@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, PercentFormatter
+from matplotlib.ticker import PercentFormatter
 
 from common.estimation.gaussian import Array
 from studies.report_figures import Scene, panels
-from studies.report_style import QUIET, look
+from studies.report_style import QUIET, bytes_axis, look
 from studies.tables import Table, rows_of
 
 if TYPE_CHECKING:
@@ -73,8 +73,6 @@ def _scatter(axes: Axes, summary: Table, measure: Measure, height: float) -> Non
     shown = np.isfinite(measure.values) & (sent > 0.0)
     if not shown.any():
         return
-    axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     modes, x, y = summary["mode"][shown], sent[shown], measure.values[shown]
     for mode, at, value in zip(modes, x, y, strict=True):
         drawn = look(mode)
@@ -82,10 +80,8 @@ def _scatter(axes: Axes, summary: Table, measure: Measure, height: float) -> Non
             at, value, marker=drawn.marker, color=drawn.colour, ms=drawn.size * 1.3, mec="white", mew=0.6, zorder=3
         )
     spread = max(float(np.ptp(y)), 0.05 if measure.share else 1.0)
-    axes.set_ylim(y.min() - (0.12 if y.min() else 0.05) * spread, y.max() + 0.12 * spread)
-    axes.set_xlim(x.min() / 1.8, x.max() * 1.8)
-    if x.max() < 30.0 * x.min():
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.set_ylim(y.min() - (0.12 if y.min() else 0.05) * spread, max(y.max(), y.min() + spread) + 0.12 * spread)
+    bytes_axis(axes, x)
     _name(axes, modes, x, y, height)
 
 

@@ -11,6 +11,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator
+
+from common.estimation.gaussian import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,6 +90,18 @@ def line(axes: Axes, mode: str, x: Any, y: Any, **style: Any) -> None:
     """A curve of a mode."""
     drawn = look(mode)
     axes.plot(x, y, color=drawn.colour, ls=drawn.line, **style)
+
+
+def bytes_axis(axes: Axes, sent: Array) -> None:
+    """A logarithmic axis of bytes that says plain numbers, and at least two of them."""
+    known = sent[sent > 0.0]
+    if not known.size:
+        return
+    axes.set_xscale("log")
+    axes.set_xlim(known.min() / 1.8, known.max() * 1.8)
+    if known.max() < 30.0 * known.min():
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def legend(figure: Figure, modes: Sequence[str]) -> None:

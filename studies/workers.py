@@ -7,7 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Generator, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeAlias
@@ -152,7 +152,7 @@ def _environment(changes: dict[str, str]) -> Iterator[None]:
 
 def _on_cluster(jobs: Iterable[Job], address: str) -> Parts:
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker
         from distributed import as_completed as as_done
     except ImportError:
         raise ConfigError("--scheduler needs dask.distributed: pip install 'waldnet[study]'") from None
@@ -166,6 +166,8 @@ def _on_cluster(jobs: Iterable[Job], address: str) -> Parts:
             for future in as_done(futures):
                 yield from future.result()
                 future.release()
+        except (CancelledError, KilledWorker) as error:
+            raise StudyError(f"the cluster at {address} gave up: {error}") from None
         except BaseException:
             client.cancel(futures)
             raise

@@ -299,6 +299,28 @@ def test_the_tables_are_the_same_on_a_cluster(tmp_path: Path, real: Order) -> No
 
 @pytest.mark.processes
 @pytest.mark.filterwarnings("ignore")
+def test_a_cluster_that_goes_is_told_and_what_is_finished_stays(tmp_path: Path, real: Order) -> None:
+    from distributed import LocalCluster
+
+    study = Study(PLOT, real._replace(runs=60, block=1), tmp_path / "s")
+    kept: list[Part] = []
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
+    ) as cluster:
+
+        def close_after_one(part: Part) -> None:
+            kept.append(part)
+            if len(kept) == 1:
+                cluster.close()
+
+        with pytest.raises(StudyError, match="gave up"):
+            study.play(1, cluster.scheduler_address, close_after_one)
+    assert 0 < len(kept) < 240
+    assert sum(study.store.has(part.job, part.mode) for part in kept) == len(kept)
+
+
+@pytest.mark.processes
+@pytest.mark.filterwarnings("ignore")
 def test_a_cluster_that_does_not_answer_is_told(fakes: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_PATIENCE_S", 1)
     study = Study(PLOT, ORDER, tmp_path / "s")

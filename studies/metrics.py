@@ -134,10 +134,9 @@ def fuse_decisions(local_log_lr: Array, limits: Thresholds) -> Array:
 
 
 def _steps(log_lr: Array) -> Array:
-    """Log Lambda of every measurement time, which axis 1 counts; after log LR = -inf nothing more can be said: 0."""
+    """Log Lambda of every measurement time, which axis 1 counts; NaN, which decides nothing, after log LR = -inf."""
     with np.errstate(invalid="ignore"):
-        steps = np.diff(log_lr, axis=1, prepend=0.0)
-    return np.where(np.isnan(steps), 0.0, steps)
+        return np.diff(log_lr, axis=1, prepend=0.0)
 
 
 def first_decisions(seen: Evidence) -> Decided:

@@ -108,7 +108,7 @@ def curves_table(judged: Judged) -> Table:
     count, log_lr = len(times_s), judged.seen.log_lr
     kept = ~lost(play.result, play.lost_beyond_m)
     scans = np.arange(1, count + 1)
-    by_now = (first.scans[:, None] <= scans) & (first.scans[:, None] > 0)
+    by_now = first.scans[:, None] <= scans
     return {
         **_keys(play, count),
         "scan": scans,

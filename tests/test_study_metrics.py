@@ -165,6 +165,14 @@ def test_the_first_sensor_to_decide_decides_unless_another_says_the_opposite() -
     np.testing.assert_allclose(seen.log_lr[1], [0.0, both, both, both + LIMITS.log_b])
 
 
+def test_a_sensor_that_saw_the_impossible_has_said_all_it_can() -> None:
+    """Once log LR is -inf, its steps are no numbers; the other sensor goes on."""
+    local = np.array([np.transpose([[-np.inf] * 4, [1.0, 5.0, 5.0, 10.0]])])
+    fused = fuse_decisions(local, LIMITS)
+    a, b = LIMITS
+    np.testing.assert_allclose(fused, [[a, a + b, a + b, a + 2 * b]])
+
+
 def test_other_thresholds_are_other_decisions_of_the_sensors() -> None:
     local = np.array([[[1.0], [2.0], [3.0], [4.0]]])
     low = evidence(result_of(np.zeros((1, 4)), local_log_lr=local), thresholds(0.3, 0.9))  # log B = 1.1

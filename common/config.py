@@ -160,6 +160,12 @@ class SensorConfig(_Model):
         return stand if fov.center is None else np.array(fov.center)
 
 
+class StudyConfig(_Model):
+    """What ``waldnet study`` asks of a track: farther from the truth after the last scan [m], it is lost."""
+
+    lost_beyond: Positive = 1000.0
+
+
 class SimulationConfig(_Model):
     """The simulated world: how long [s], and the seed of everything random."""
 
@@ -216,6 +222,7 @@ class Scenario(_Model):
     fusion: FusionConfig = FusionConfig()
     sensors: Annotated[tuple[SensorConfig, ...], Field(alias="sensor", min_length=1)]
     simulation: SimulationConfig | None = None
+    study: StudyConfig = StudyConfig()
     recording: RecordingConfig | None = None
     targets: Annotated[tuple[TargetConfig, ...], Field(alias="target")] = ()
     hypotheses: Annotated[tuple[HypothesisConfig, ...], Field(alias="hypothesis")] = ()

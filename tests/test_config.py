@@ -72,6 +72,9 @@ field_of_view = { shape = "everywhere", area = 1e6 }
 duration = 60.0
 seed = 4
 
+[study]
+lost_beyond = 250.0
+
 [recording]
 plots = "plots.jsonl"
 
@@ -125,6 +128,7 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
     assert loaded.sensors[0].first_scan == 0.5
     assert loaded.simulation is not None
     assert (loaded.simulation.duration, loaded.simulation.seed) == (60.0, 4)
+    assert loaded.study.lost_beyond == 250.0
     assert loaded.targets[0].state == (0.0, 0.0, 150.0, 0.0)
     assert (loaded.targets[1].hypothesis, loaded.targets[1].state) == (0, None)
     assert np.array_equal(loaded.hypotheses[0].density.P, np.diag([100.0**2, 90.0**2, 20.0**2, 10.0**2]))
@@ -282,6 +286,7 @@ FAULTS = [
     ("area = 1e6", "area = inf", "sensor.2.field_of_view.area: inf is not positive and finite"),
     # world
     ("duration = 60.0\n", "", "simulation.duration: is missing"),
+    ("lost_beyond = 250.0", "lost_beyond = 0", "study.lost_beyond: 0 is not positive and finite"),
     ("seed = 4", "seed = -4", "simulation.seed: got -4: input should be greater than or equal to 0"),
     ("state = [0.0, 0.0, 150.0, 0.0]\n\n[[target]]\nh", "\n[[target]]\nh", "target.0: give either state or hypothesis"),
     ("start = -4.0", "hypothesis = 0", "target.0: give either state or hypothesis"),

@@ -10,7 +10,7 @@ from exact_walk import ever_above, renewal_constant
 from scipy.stats import binomtest
 
 from common.estimation.gaussian import Array
-from studies.calibration import calibration, crossing_weights
+from studies.importance import calibration, crossing_weights
 
 B = np.array([2.0, 10.0, 1e2, 1e4, 1e6])
 

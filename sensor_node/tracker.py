@@ -262,7 +262,7 @@ class LocalTracker:
                     Gaussian(x_a[due], P_a[due]), self.motion, _interval(times[due], scan.time_ns)
                 )
                 linear = self.sensor.measurement.linearise(predicted, scan.position)
-                filtered = pdaf(predicted, Plots(scan.z), linear, self._clutter(predicted, scan.position))
+                filtered = pdaf(predicted, self._plots(scan), linear, self._clutter(predicted, scan.position))
                 (x_a[due], P_a[due]), times[due] = filtered.density, scan.time_ns
         return tracks._replace(x_a=x_a, P_a=P_a, times_a_ns=times)
 
@@ -301,9 +301,12 @@ class LocalTracker:
 
     def _update(self, predicted: Tracks, expected: Expected, scan: Scan) -> Tracks:
         """Filter a scan."""
-        (x, P), log_p_bar = update(expected, Plots(scan.z))
+        (x, P), log_p_bar = update(expected, self._plots(scan))
         tracks = predicted._replace(log_p_bar=predicted.log_p_bar + log_p_bar, x=x[0], P=P[0])
         return tracks._replace(x_a=x[1], P_a=P[1]) if self.tight else tracks
+
+    def _plots(self, scan: Scan) -> Plots:
+        return Plots(scan.z, log_relative=self.sensor.log_relative(scan.z, scan.position))
 
     def _clutter(self, density: Gaussian, position: Array) -> Clutter:
         p_d = self.sensor.detection_probability(density, position, self.config.view_center(position))

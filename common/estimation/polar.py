@@ -60,6 +60,10 @@ class Polar(NamedTuple):
         """Plots whose noise led out of the range of their numbers, as the sensor would give them, shape (..., m)."""
         return to_polar(to_cartesian(z))
 
+    def draw_false(self, rng: np.random.Generator, places: Array, stand: Array) -> Array:  # noqa: ARG002
+        """False plots at given positions, shapes (M, d), (d,) to (M, m)."""
+        return self.observe(places, stand)
+
     def space(self, volume: float) -> float:
         """Size of the plot space that false plots come from, up to ``log_stretch``: that of the field of view."""
         return volume
@@ -129,6 +133,11 @@ class PolarDoppler(NamedTuple):
         """Plots whose noise led out of the range of their numbers, as the sensor would give them, shape (..., m)."""
         return np.concatenate([self._polar.fold(z[..., :-1]), z[..., -1:]], axis=-1)
 
+    def draw_false(self, rng: np.random.Generator, places: Array, stand: Array) -> Array:
+        """False plots at given positions, shapes (M, d), (d,) to (M, m)."""
+        speeds = rng.uniform(-self.max_speed, self.max_speed, (len(places), 1))
+        return np.concatenate([self._polar.observe(places, stand), speeds], axis=-1)
+
     def space(self, volume: float) -> float:
         """Size of the plot space that false plots come from, up to ``log_stretch``."""
         return volume * 2.0 * self.max_speed
@@ -183,6 +192,10 @@ class Bearing(NamedTuple):
     def fold(self, z: Array) -> Array:
         """Plots whose noise led out of the range of their numbers, as the sensor would give them, shape (..., m)."""
         return to_polar(self.locate(z, np.zeros(1 + len(self.sigma))))[..., 1:]
+
+    def draw_false(self, rng: np.random.Generator, places: Array, stand: Array) -> Array:  # noqa: ARG002
+        """False plots at given positions, shapes (M, d), (d,) to (M, m)."""
+        return self.observe(places, stand)
 
     def space(self, volume: float) -> float:  # noqa: ARG002 (a bearing has no distance)
         """Size of the plot space that false plots come from, up to ``log_stretch``."""

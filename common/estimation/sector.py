@@ -91,12 +91,10 @@ class Sector(NamedTuple):
         azimuth = self.direction + (share[:, 1] - 0.5) * self.width
         flat = np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
         if self.elevation is None:
-            points: Array = center + r[:, None] * flat
-            return points
+            return np.asarray(center + r[:, None] * flat)
         low, high = np.sin(self.elevation)
         up = low + share[:, 2] * (high - low)
-        points = center + r[:, None] * np.column_stack([np.sqrt(1.0 - up**2)[:, None] * flat, up])
-        return points
+        return np.asarray(center + r[:, None] * np.column_stack([np.sqrt(1.0 - up**2)[:, None] * flat, up]))
 
     def _azimuth(self, offset: Array) -> Array:
         """Azimuth from the middle of the sector, in [-pi, pi]."""

@@ -61,6 +61,10 @@ class Measurement(Protocol):
         """Plots whose noise led out of the range of their numbers, as the sensor would give them, shape (..., m)."""
         ...
 
+    def draw_false(self, rng: np.random.Generator, places: Array, stand: Array) -> Array:
+        """False plots at given positions, shapes (M, d), (d,) to (M, m)."""
+        ...
+
     def space(self, volume: float) -> float:
         """Size of the plot space that false plots come from, up to ``log_stretch``.
 
@@ -120,6 +124,10 @@ class Position(NamedTuple):
     def fold(self, z: Array) -> Array:
         """Plots as the sensor would give them: as they are, shape (..., m)."""
         return z
+
+    def draw_false(self, rng: np.random.Generator, places: Array, stand: Array) -> Array:  # noqa: ARG002
+        """False plots at given positions, shapes (M, d), (d,) to (M, m)."""
+        return places
 
     def space(self, volume: float) -> float:
         """Size of the plot space that false plots come from: that of the field of view."""

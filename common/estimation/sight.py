@@ -44,7 +44,7 @@ class Look(NamedTuple):
 
 
 class Approach(NamedTuple):
-    """Speed away from a sensor [m/s], shape (...); its slope by the state, (..., n); the variance that this leaves out."""
+    """Speed away from a sensor [m/s], shape (...); its slope by the state, (..., n); the variance this leaves out."""
 
     speed: Array
     slope: Array

@@ -77,6 +77,10 @@ class SigmaPoint(NamedTuple):
         """Plots whose noise led out of the range of their numbers, as the sensor would give them, shape (..., m)."""
         return self.measurement.fold(z)
 
+    def draw_false(self, rng: np.random.Generator, places: Array, stand: Array) -> Array:
+        """False plots at given positions, shapes (M, d), (d,) to (M, m)."""
+        return self.measurement.draw_false(rng, places, stand)
+
     def space(self, volume: float) -> float:
         """Size of the plot space that false plots come from, up to ``log_stretch``."""
         return self.measurement.space(volume)

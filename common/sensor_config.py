@@ -204,8 +204,9 @@ class SensorConfig(Model):
             measurement = PolarDoppler(self.sigma, n, self.max_speed or _MAX_SPEED)
         else:
             measurement = Bearing(self.sigma, n, self._directions(d))
-        used = 2 * d if self.kind == "polar-doppler" else d
-        return SigmaPoint(measurement, used) if self.update == "sigma-point" else measurement
+        if self.update == "sigma-point":
+            return SigmaPoint(measurement, d, self.kind == "polar-doppler")
+        return measurement
 
     def _directions(self, dimensions: int) -> float:
         """Angle, in 3-D solid angle, that false bearings come from."""

@@ -72,7 +72,7 @@ class Swerling(NamedTuple):
         Largest error measured 4e-4, standard deviations of the position up to a tenth of ``at_range``.
         """
         d = len(stand)
-        xi, w = product_points(d)
+        xi, w = product_points(d, 5)
         L = cholesky(state.P[..., :d, :d])
         positions = state.x[..., None, :d] + xi @ L.mT
         return np.asarray(np.vecdot(self.share(positions, stand), w))

@@ -2,11 +2,11 @@
 
 A GMTI radar detects with ``p_d(x) = p_d (1 - c_n N(n_c(x); 0, v_n))``, n_c the speed of the target away from it. So
 each hypothesis ends in two terms, N as an ordinary update leaves it, and N after a fictitious measurement ``n_c = 0``
-with variance v_n and weight ``b``: positive for a missed detection, which speaks for the notch, and negative for a plot.
+with variance v_n and weight ``b``: positive for a missed detection, which speaks for the notch, negative for a plot.
 
 Both terms differ along one direction only. With n_c linear, ``y = n_c(x) ~ N(y0, s2)`` and ``k = P h / s2``, the rest
 of the state, ``x - k y``, is independent of y, and the notch does not touch it; so the mean of x moves by k times the
-shift of y's, and its covariance changes by ``k k'`` times the change of y's variance. For two terms of the weights 1 - b
+shift of y's, and its covariance changes by ``k k'`` times the change of its variance. For two terms of weights 1 - b
 and b, with ``rho = s2 / (s2 + v_n)`` and ``d = rho y0``::
 
     mean(y) = y0 - b d          var(y) = s2 (1 - b rho) + b (1 - b) d^2

@@ -93,34 +93,46 @@ def _gauss(integrand: Integrand, owner: Indices, lower: Array, upper: Array) -> 
     return value
 
 
-def unit_points(n: int) -> tuple[Array, Array]:
-    """Points and weights with the mean, the covariance and, for n <= 3, the fourth moments of N(0, I) along the axes.
-
-    The unscented transform with its points sqrt(3) away; in more than three dimensions its middle weight would be
-    negative, and the cubature rule, sqrt(n) away and without a middle, takes its place.
-
-    Returns:
-        points, shape (2 n + 1, n), and weights, shape (2 n + 1,), none negative.
-
-    References:
-        Julier & Uhlmann, Unscented filtering (2004); Arasaratnam & Haykin, Cubature Kalman filters (2009).
-    """
-    spread = float(max(n, 3))
-    axes = np.sqrt(spread) * np.eye(n)
-    weights = np.full(2 * n + 1, 0.5 / spread)
-    weights[0] = 1.0 - n / spread
-    return np.concatenate([np.zeros((1, n)), axes, -axes]), weights
-
-
 @cache
-def product_points(n: int) -> tuple[Array, Array]:
-    """Points and weights of the product rule of Gauss and Hermite for N(0, I), five points an axis.
+def product_points(n: int, per_axis: int) -> tuple[Array, Array]:
+    """Points and weights of the product rule of Gauss and Hermite for N(0, I).
+
+    Args:
+        n: dimensions.
+        per_axis: points an axis.
 
     Returns:
-        points, shape (5^n, n), and weights, shape (5^n,), to read only.
+        points, shape (per_axis^n, n), and weights, shape (per_axis^n,), to read only.
     """
-    node, weight = np.polynomial.hermite_e.hermegauss(5)
+    node, weight = np.polynomial.hermite_e.hermegauss(per_axis)
     points = np.stack(np.meshgrid(*[node] * n, indexing="ij"), axis=-1).reshape(-1, n)
     weights = np.stack(np.meshgrid(*[weight / weight.sum()] * n, indexing="ij"), axis=-1).reshape(-1, n).prod(axis=-1)
     points.flags.writeable = weights.flags.writeable = False
     return points, weights
+
+
+@cache
+def sigma_points(curved: int, straight: int) -> tuple[Array, Array]:
+    """Points and weights for N(0, I), for functions that are curved in some numbers and linear in others.
+
+    The product rule with three points an axis in the former: unlike the 2 n + 1 points of the unscented transform they
+    see the corners, without which a bend between two axes would pass for a line. The cubature rule in the latter.
+
+    Args:
+        curved: how many numbers, counted from the first, a function is curved in.
+        straight: how many more it is linear in, given those.
+
+    Returns:
+        points, shape (K, curved + straight), and weights, shape (K,), all positive, to read only.
+
+    References:
+        S. Särkkä, Bayesian filtering and smoothing (2013), §6.3; Arasaratnam & Haykin, Cubature Kalman filters (2009).
+    """
+    points, weights = product_points(curved, 3)
+    if straight == 0:
+        return points, weights
+    axes = np.sqrt(straight) * np.concatenate([np.eye(straight), -np.eye(straight)])
+    both = np.concatenate([np.repeat(points, len(axes), axis=0), np.tile(axes, (len(points), 1))], axis=-1)
+    shares = np.repeat(weights / len(axes), len(axes))
+    both.flags.writeable = shares.flags.writeable = False
+    return both, shares

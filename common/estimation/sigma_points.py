@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.estimation.gaussian import Array, Gaussian, cholesky
-from common.estimation.quadrature import unit_points
+from common.estimation.quadrature import sigma_points
 from common.estimation.sensing import Linearised, Measurement
 
 
@@ -16,11 +16,13 @@ class SigmaPoint(NamedTuple):
 
     Attributes:
         measurement: what a plot measures.
-        used: how many of the first numbers of the state a plot depends on.
+        d: size of the position, in which a plot is curved.
+        doppler: whether a plot depends on the velocity too, linearly so.
     """
 
     measurement: Measurement
-    used: int
+    d: int
+    doppler: bool
 
     @property
     def m(self) -> int:
@@ -51,10 +53,11 @@ class SigmaPoint(NamedTuple):
         References:
             theory.md §2; S. Särkkä, Bayesian filtering and smoothing (2013), §5.4 and 5.5.
         """
-        xi, w = unit_points(self.used)
-        L = cholesky(density.P[..., : self.used, : self.used])
+        xi, w = sigma_points(self.d, self.d if self.doppler else 0)
+        used = xi.shape[-1]
+        L = cholesky(density.P[..., :used, :used])
         states = np.repeat(density.x[..., None, :], len(w), axis=-2)
-        states[..., : self.used] += xi @ L.mT
+        states[..., :used] += xi @ L.mT
         plots = self.observe(states, origin)
         angular = self.angular
         z = np.vecmat(w, plots)
@@ -66,7 +69,7 @@ class SigmaPoint(NamedTuple):
         G = (w[:, None] * deviations).mT @ xi
         rest = deviations - xi @ G.mT
         H = np.zeros((*z.shape, density.x.shape[-1]))
-        H[..., : self.used] = np.linalg.solve(L.mT, G.mT).mT
+        H[..., :used] = np.linalg.solve(L.mT, G.mT).mT
         return Linearised(z + shift, H, self.R + (w[:, None] * rest).mT @ rest, angular)
 
     def locate(self, z: Array, origin: Array) -> Array:

@@ -34,6 +34,7 @@ from common.quantities import (
 )
 from common.sensor_config import BoxConfig as BoxConfig
 from common.sensor_config import DiscConfig as DiscConfig
+from common.sensor_config import SectorConfig as SectorConfig
 from common.sensor_config import SensorConfig as SensorConfig
 from common.sensor_config import sensor_faults, wrong_length
 

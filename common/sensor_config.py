@@ -36,6 +36,11 @@ from common.quantities import (
 
 #: Range rates of false plots reach so far unless the file says otherwise [m/s].
 _MAX_SPEED = 300.0
+_NUMBERS = {
+    "position": ("east", "north", "up"),
+    "polar": ("range", "azimuth", "elevation"),
+    "bearing": ("azimuth", "elevation"),
+}
 
 
 class EverywhereConfig(Model):
@@ -229,12 +234,12 @@ class SensorConfig(Model):
         return np.array(fov.center)
 
     @property
-    def angles(self) -> dict[int, tuple[str, float]]:
-        """Which numbers of a plot are angles, what they are called, and how large they get [rad]."""
-        first = {"position": 9, "bearing": 0}.get(self.kind, 1)
-        count = len(self.sigma) - (self.kind == "polar-doppler")
-        names = (("azimuth", 2.0 * np.pi), ("elevation", 0.5 * np.pi))
-        return dict(zip(range(first, count), names, strict=False))
+    def numbers(self) -> tuple[str, ...]:
+        """What the numbers of a plot are."""
+        m = len(self.sigma)
+        if self.kind == "polar-doppler":
+            return (*_NUMBERS["polar"][: m - 1], "range rate")
+        return _NUMBERS[self.kind][:m]
 
 
 def sensor_faults(sensor: Mapping[str, Any], dimensions: int, where: str) -> Iterator[str]:

@@ -15,7 +15,7 @@ from scipy import stats
 from common.config import Scenario, load_scenario
 from common.errors import PlotsError
 from common.estimation.gaussian import Array
-from common.messages import Decision, Tracks
+from common.messages import Decision, Scan, Tracks
 from scenarios import catalogue
 from scenarios.plots import read_plots, write_plots
 from scenarios.world import simulate, simulate_all, truth
@@ -235,3 +235,22 @@ def test_the_report_shows_plots_where_they_lie(tmp_path: Path) -> None:
         record.note(message)
     files = write_report(record, tmp_path, {})
     assert all(file.stat().st_size > 0 for file in files)
+
+
+def test_a_node_weights_plots_with_the_density_of_false_ones_at_their_range() -> None:
+    """Eq. (6) of one polar plot, 2500 m away, at a density of false plots of rho_f times its range."""
+    view = {"shape": "disc", "radius": 10_000.0}
+    plot = scenario(
+        sensor_table("a", kind="polar", sigma=[20.0, 0.01], position=[0.0, 0.0], field_of_view=view),
+        motion={"psd": 0.0},
+        fusion={"association": "factor", "gate_probability": 1.0},
+        hypothesis=[{"state": [1500.0, 2000.0, 0.0, 0.0], "sigma": [50.0, 50.0, 1e-6, 1e-6]}],
+    )
+    z = np.array([2510.0, np.arctan2(1500.0, 2000.0) + 0.02])
+    scan = Scan("a", plot.to_ns(2.0), np.zeros(2), z[None])
+    (picture,) = [message for message in Replay(plot, [scan]).run() if isinstance(message, Tracks)]
+    H = np.array([[0.6, 0.8], [0.8 / 2500.0, -0.6 / 2500.0]])
+    S = 2500.0 * H @ H.T + np.diag([400.0, 1e-4])
+    rho_f = 2.0 / (np.pi * 10_000.0**2) * 2510.0
+    p_bar = 0.1 + 0.9 / rho_f * stats.multivariate_normal([2500.0, z[1] - 0.02], S).pdf(z)
+    assert picture.log_lr_total[0] == pytest.approx(np.log(p_bar), rel=1e-9)

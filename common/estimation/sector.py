@@ -5,8 +5,8 @@ and the part along it; the latter has a closed form between two ranges, and adap
 2-D the azimuth, in 3-D the elevation within vertical half-planes and then their azimuth. Nothing is subtracted that
 could cancel, however far the sensor is.
 
-Largest absolute errors measured (dense quadrature, SciPy's distribution functions), axis ratios of the covariance up to
-100 and sigmas of 1e-3 to 10 radii: 1e-9 in 2-D and in 3-D.
+Largest absolute errors measured: 4e-10 (dense quadrature on a grid in 2-D, sigmas of 0.03 to 1 radius), 4e-11 (a ring as
+the difference of two discs or balls, sigmas of 1e-4 to 1 radius, axis ratios of the covariance up to 100).
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from common.estimation.quadrature import CERTAIN, Indices, decide, integrate, no
 # In radii, as in field_of_view.py.
 _SIGMA_MIN = 1e-7
 _RIGHT = 0.5 * np.pi
+# From this ratio of its axes on, a Gaussian is a needle, which quadrature might overlook.
+_NEEDLE = 0.2
 
 
 class Sector(NamedTuple):
@@ -106,19 +108,25 @@ class Sector(NamedTuple):
 
         The sector is where all of its conditions hold: inside, the nearest edge counts, outside, the farthest.
         """
-        r, ground = np.linalg.vector_norm(offset, axis=-1), np.hypot(offset[..., 0], offset[..., 1])
+        ground = np.hypot(offset[..., 0], offset[..., 1])
+        up = np.zeros_like(ground) if self.elevation is None else offset[..., 2]
+        margin = self._margin_in_slice(np.stack([ground, up], axis=-1))
+        if self.width < 2.0 * np.pi:
+            margin = np.minimum(margin, _across(ground, 0.5 * self.width - np.abs(self._azimuth(offset))))
+        return np.asarray(margin)
+
+    def _margin_in_slice(self, offset: Array) -> Array:
+        """The same within a vertical half-plane (distance from the axis, up), shape (..., 2) to (...)."""
+        r = np.hypot(offset[..., 0], offset[..., 1])
         margin = self.radius - r
         if self.inner > 0.0:
             margin = np.minimum(margin, r - self.inner)
-        if self.width < 2.0 * np.pi:
-            margin = np.minimum(margin, _across(ground, 0.5 * self.width - np.abs(self._azimuth(offset))))
-        if self.elevation is not None:
-            low, high = self.elevation
-            e = np.arctan2(offset[..., 2], ground)
-            if low > -_RIGHT:
-                margin = np.minimum(margin, _across(r, e - low))
-            if high < _RIGHT:
-                margin = np.minimum(margin, _across(r, high - e))
+        low, high = self.elevation or (-_RIGHT, _RIGHT)
+        e = np.arctan2(offset[..., 1], offset[..., 0])
+        if low > -_RIGHT:
+            margin = np.minimum(margin, _across(r, e - low))
+        if high < _RIGHT:
+            margin = np.minimum(margin, _across(r, high - e))
         return np.asarray(margin)
 
     def _turn(self) -> Array:
@@ -138,10 +146,14 @@ class Sector(NamedTuple):
         half = np.full(len(mean), 0.5 * self.width)
 
         def integrand(owner: Indices, azimuth: Array) -> Array:
-            across, plane = _slices(mean[owner], P[owner], azimuth)
-            worth = across.ravel() > 0.0
-            value = np.zeros(worth.size)
-            value[worth] = self._in_slice(plane.x.reshape(-1, 2)[worth], plane.P.reshape(-1, 2, 2)[worth])
+            sigmas, across, plane = _slices(mean[owner], P[owner], azimuth)
+            x, rest = plane.x.reshape(-1, 2), plane.P.reshape(-1, 2, 2)
+            margin = np.minimum(self._margin_in_slice(x), x[:, 0]) / _largest_sigma(rest)
+            # A slice that is all inside gives its mean distance from the axis.
+            value = np.where(margin >= CERTAIN, x[:, 0], 0.0)
+            open_ = (np.abs(margin) < CERTAIN) & (sigmas.ravel() < CERTAIN)
+            if open_.any():
+                value[open_] = self._in_slice(x[open_], rest[open_])
             return across * value.reshape(across.shape)
 
         return integrate(integrand, _breaks(mean[:, :2], P[:, :2, :2], -half, half))
@@ -189,7 +201,7 @@ def _across(distance: Array, angle: Array) -> Array:
     return distance * np.sin(np.clip(angle, -_RIGHT, _RIGHT))
 
 
-def _slices(mean: Array, P: Array, azimuth: Array) -> tuple[Array, Gaussian]:
+def _slices(mean: Array, P: Array, azimuth: Array) -> tuple[Array, Array, Gaussian]:
     """Cut Gaussians by vertical half-planes.
 
     Args:
@@ -198,8 +210,8 @@ def _slices(mean: Array, P: Array, azimuth: Array) -> tuple[Array, Gaussian]:
         azimuth: of the half-planes, shape (K, nodes).
 
     Returns:
-        density across each half-plane at it, shape (K, nodes), and what is left in it (distance from the axis, up),
-        shapes (K, nodes, 2), (K, nodes, 2, 2).
+        how many sigmas each half-plane is from the mean, and the density across it there, shapes (K, nodes); what is
+        left in it (distance from the axis, up), shapes (K, nodes, 2), (K, nodes, 2, 2).
     """
     c, s, zero = np.cos(azimuth), np.sin(azimuth), np.zeros_like(azimuth)
     along = np.stack([np.stack([c, s, zero], -1), np.stack([zero, zero, zero + 1.0], -1)], axis=-2)
@@ -210,7 +222,8 @@ def _slices(mean: Array, P: Array, azimuth: Array) -> tuple[Array, Gaussian]:
     gain = np.matvec(along, Pa)
     x = np.matvec(along, mean[:, None]) - gain * (offset / variance)[..., None]
     rest = along @ cov @ along.mT - gain[..., :, None] * gain[..., None, :] / variance[..., None, None]
-    return normal(offset / np.sqrt(variance)) / np.sqrt(variance), Gaussian(x, rest)
+    sigma = np.sqrt(variance)
+    return np.abs(offset) / sigma, normal(offset / sigma) / sigma, Gaussian(x, rest)
 
 
 def _breaks(mean: Array, P: Array, low: Array, high: Array) -> Array:
@@ -226,13 +239,23 @@ def _breaks(mean: Array, P: Array, low: Array, high: Array) -> Array:
         ascending, shape (K, breaks).
     """
     a, b, ab = P[:, 0, 0], P[:, 1, 1], P[:, 0, 1]
-    sigma = np.sqrt(0.5 * (a + b) + np.hypot(0.5 * (a - b), ab))
+    sigma = _largest_sigma(P)
     seen = np.arctan2(mean[:, 1], mean[:, 0])
     distance = np.hypot(mean[:, 0], mean[:, 1])
     reach = np.where(distance > CERTAIN * sigma, CERTAIN * sigma / np.maximum(distance, CERTAIN * sigma), 1.0)
     reach = np.where(reach < 1.0, np.arcsin(np.minimum(reach, 1.0)), np.pi)
-    axis = 0.5 * np.arctan2(2.0 * ab, a - b)
-    angles = np.stack([seen - reach, seen, seen + reach, axis, axis + np.pi], axis=-1)
+    needle = a * b - ab * ab < (_NEEDLE * sigma**2) ** 2
+    axis = np.where(needle, 0.5 * np.arctan2(2.0 * ab, a - b), seen)
+    angles = np.stack([seen - reach, seen, seen + reach, axis, axis + np.where(needle, np.pi, 0.0)], axis=-1)
     around = np.remainder(angles + np.pi, 2.0 * np.pi) - np.pi
+    whole = (seen - reach >= -np.pi) & (seen + reach <= np.pi)
+    low = np.where(whole, np.clip(seen - reach, low, high), low)
+    high = np.where(whole, np.clip(seen + reach, low, high), high)
     inner = np.clip(around, low[:, None], high[:, None])
     return np.sort(np.column_stack([low, inner, high]), axis=-1)
+
+
+def _largest_sigma(P: Array) -> Array:
+    """Standard deviation along the longest axis, shape (K, 2, 2) to (K,)."""
+    a, b, ab = P[:, 0, 0], P[:, 1, 1], P[:, 0, 1]
+    return np.asarray(np.sqrt(0.5 * (a + b) + np.hypot(0.5 * (a - b), ab)))

@@ -5,8 +5,8 @@ and the part along it; the latter has a closed form between two ranges, and adap
 2-D the azimuth, in 3-D the elevation within vertical half-planes and then their azimuth. Nothing is subtracted that
 could cancel, however far the sensor is.
 
-Largest absolute errors measured: 4e-10 (dense quadrature on a grid in 2-D, sigmas of 0.03 to 1 radius), 4e-11 (a ring as
-the difference of two discs or balls, sigmas of 1e-4 to 1 radius, axis ratios of the covariance up to 100).
+Largest absolute errors measured: 4e-10 (dense quadrature on a grid in 2-D, sigmas of 0.03 to 1 radius), 4e-11 (a ring
+as the difference of two discs or balls, sigmas of 1e-4 to 1 radius, axis ratios of the covariance up to 100).
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from common.messages import Decision, Scan, Tracks
 from scenarios import catalogue
 from scenarios.plots import read_plots, write_plots
 from scenarios.world import simulate, simulate_all, truth
+from studies.network import run_in_memory
 from studies.record import Record, write_report
 from studies.replay import Replay
 
@@ -208,6 +209,15 @@ def test_mixed_sensors_confirm_the_target_and_delete_the_decoy(seed: int) -> Non
             error = picture.x[0] - world.x[0, np.searchsorted(world.times_ns, picture.time_ns)]
             nees.append(error @ np.linalg.solve(picture.P[0], error))
     assert 1.5 < np.mean(nees) < 10.0
+
+
+def test_nodes_and_center_on_a_bus_decide_as_the_replay_does() -> None:
+    """Scans of one, two and three numbers a plot cross the codec."""
+    scans = [scan for scan in simulate_all(MIXED, 1) if MIXED.to_seconds(scan.time_ns) <= 8.0]
+    heard = run_in_memory(MIXED, scans)
+    replayed = [message for message in Replay(MIXED, scans).run() if isinstance(message, Decision)]
+    assert [(d.track, d.kind, d.time_ns) for d in heard.standing()] == [(d.track, d.kind, d.time_ns) for d in replayed]
+    assert {scan.z.shape[1] for scan in heard.scans} == {1, 2, 3}
 
 
 @pytest.mark.parametrize("without", MIXED.sensor_names)

@@ -1,4 +1,4 @@
-"""Negative information: what a plot, and a missed detection, say about a target that may hide in the clutter notch.
+"""Negative information: what a plot, and a miss, say about a target that may hide in the clutter notch (Eq. 19).
 
 A GMTI radar detects with ``p_d(x) = p_d (1 - c_n N(n_c(x); 0, v_n))``, n_c the speed of the target away from it. So
 each hypothesis ends in two terms, N as an ordinary update leaves it, and N after a fictitious measurement ``n_c = 0``
@@ -53,7 +53,7 @@ class Hypotheses(NamedTuple):
 
 
 def hypotheses(expected: Expected, plots: Plots, notch: Notch, stand: Array) -> Hypotheses:
-    """Weights and densities of the hypotheses about one scan of a radar with a clutter notch (theory.md §10).
+    """Weights and densities of the hypotheses about one scan of a radar with a clutter notch (Eq. 19).
 
     Args:
         expected: tracks predicted to the time of the scan; their detection probability without the notch.

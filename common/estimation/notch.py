@@ -29,8 +29,9 @@ from common.estimation.association import (
     innovations,
     log_weights,
     normalise,
+    update,
 )
-from common.estimation.detection import Notch, log_blind
+from common.estimation.detection import Detection, Notch, log_blind
 from common.estimation.gaussian import Array, Gaussian, moments, squared_norm, symmetric, times_transposed
 from common.estimation.sight import approach
 
@@ -50,6 +51,26 @@ class Hypotheses(NamedTuple):
 
     log_p_star: Array
     density: Gaussian
+
+
+def work_in(
+    expected: Expected, plots: Plots, detection: Detection, stand: Array, choose: Choice = normalise
+) -> Filtered:
+    """``association.update``, by way of the hypotheses' own densities where the radar has a notch.
+
+    Args:
+        expected: tracks predicted to the time of the scan, by the sensor ``without_notch``.
+        plots: of the scan.
+        detection: how detection depends on the target.
+        stand: where the sensor stands [m], shape (d,).
+        choose: how much each hypothesis counts.
+
+    Returns:
+        posteriors of all filters and log p_bar of the first.
+    """
+    if isinstance(detection, Notch):
+        return filtered(hypotheses(expected, plots, detection, stand), choose)
+    return update(expected, plots, choose)
 
 
 def hypotheses(expected: Expected, plots: Plots, notch: Notch, stand: Array) -> Hypotheses:

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from common.estimation.detection import Constant, Detection
+from common.estimation.detection import Constant, Detection, Notch
 from common.estimation.field_of_view import FieldOfView
 from common.estimation.gaussian import Array, BoolArray, Gaussian
 
@@ -159,6 +159,11 @@ class Sensor(NamedTuple):
     def log_rho_f(self) -> float:
         """Logarithm of the density of false plots [1/volume of z], where ``log_relative`` is 0."""
         return float(np.log(self.false_plots) - np.log(self.measurement.space(self.field_of_view.volume)))
+
+    @property
+    def without_notch(self) -> Sensor:
+        """The sensor as if it had no clutter notch: what ``notch.work_in`` starts from."""
+        return self._replace(detection=Constant()) if isinstance(self.detection, Notch) else self
 
     def log_relative(self, z: Array, stand: Array) -> Array | None:  # noqa: ARG002 (plots count from the stand)
         """Log of the density of false plots where a plot lies, relative to ``log_rho_f`` (theory.md §2).

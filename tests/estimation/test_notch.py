@@ -11,10 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from common.estimation.association import Clutter, Expected, Filtered, Plots, expect, kalman, nearest, update
-from common.estimation.detection import Notch
+from common.estimation.detection import Constant, Detection, Notch
+from common.estimation.field_of_view import Everywhere
 from common.estimation.gaussian import Array, Gaussian
-from common.estimation.notch import Hypotheses, filtered, hypotheses
-from common.estimation.sensing import Position
+from common.estimation.notch import Hypotheses, filtered, hypotheses, work_in
+from common.estimation.sensing import Position, Sensor
 
 Draw: TypeAlias = Callable[..., Gaussian]
 
@@ -173,6 +174,30 @@ def test_without_a_notch_it_is_the_update(draw: Draw, choose: Callable[..., tupl
     np.testing.assert_allclose(ours.log_p_bar, plain.log_p_bar, rtol=0.0, atol=1e-7)
     np.testing.assert_allclose(ours.density.x, plain.density.x, rtol=0.0, atol=1e-7)
     np.testing.assert_allclose(ours.density.P, plain.density.P, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("detection", [Constant(), NOTCH])
+def test_a_scan_is_worked_in_as_the_radar_detects(draw: Draw, detection: Detection) -> None:
+    rng = np.random.default_rng(6)
+    tracks = one(draw(rng, (), 4))
+    sensor = Sensor(SENSOR, P_D, 1.0, Everywhere(1e3, 2), detection)
+    p_d = sensor.without_notch.detection_probability(Gaussian(tracks.x[0], tracks.P[0]), FAR, np.zeros(2))
+    assert p_d == P_D
+    seen, scan = expected(tracks, p_d), Plots(rng.normal(size=(2, 2)))
+    ours = work_in(seen, scan, detection, FAR, nearest)
+    theirs = (
+        update(seen, scan, nearest) if detection != NOTCH else filtered(hypotheses(seen, scan, NOTCH, FAR), nearest)
+    )
+    assert same(ours, theirs)
+
+
+def test_the_mean_probability_is_that_of_the_weights(draw: Draw) -> None:
+    """1 - p*_0 with the notch is what the sensor says of itself: its network's p_bar and this filter's agree."""
+    tracks = one(draw(np.random.default_rng(7), (), 4))
+    sensor = Sensor(SENSOR, P_D, 1.0, Everywhere(1e3, 2), NOTCH)
+    p_d = sensor.detection_probability(Gaussian(tracks.x[0], tracks.P[0]), FAR, np.zeros(2))
+    found = hypotheses(expected(tracks), Plots(np.empty((0, 2))), NOTCH, FAR)
+    assert 1.0 - np.exp(found.log_p_star[0, 0]) == pytest.approx(float(p_d), rel=1e-12)
 
 
 def test_tight_association_is_equation_13(draw: Draw) -> None:

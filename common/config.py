@@ -7,18 +7,15 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from common.errors import ConfigError
-from common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.motion import Motion
+from common.estimation.gaussian import Gaussian
 from common.estimation.representation import Share
-from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import Thresholds, thresholds
 from common.fusion_config import FusionConfig, fusion_faults
 from common.motion_config import MotionConfig, motion_faults, numbers_per_axis
@@ -26,23 +23,25 @@ from common.quantities import (
     NS_PER_S,
     WITHIN_RANGE,
     Count,
-    FalsePlots,
     Finite,
     InnerProbability,
     Instant,
+    Model,
     Name,
-    NotNegative,
     Positive,
-    Probability,
     Seconds,
 )
+from common.sensor_config import BoxConfig as BoxConfig
+from common.sensor_config import DiscConfig as DiscConfig
+from common.sensor_config import SectorConfig as SectorConfig
+from common.sensor_config import SensorConfig as SensorConfig
+from common.sensor_config import sensor_faults, wrong_length
+
+#: Tables that come in kinds, and the key that tells which.
+_TAGGED = {"field_of_view": "shape", "detection": "model"}
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Network(_Model):
+class Network(Model):
     """How one process takes part in a Zenoh network; endpoints look like ``tcp/192.168.1.7:7447``.
 
     ``link_bit_s`` is the rate of its slowest link, where that is below some Mbit/s: reports then overtake plots there.
@@ -56,14 +55,14 @@ class Network(_Model):
     link_bit_s: Positive | None = None
 
 
-class Origin(_Model):
+class Origin(Model):
     """Origin of the local east-north frame."""
 
     latitude: Annotated[float, Field(ge=-90.0, le=90.0, strict=True)]
     longitude: Annotated[float, Field(ge=-180.0, le=180.0, strict=True)]
 
 
-class DecisionConfig(_Model):
+class DecisionConfig(Model):
     """Wald's test: p0 accept h1 under h0, p1 accept h1 under h1; not enabled, LR is computed and nothing decided."""
 
     p0: InnerProbability = 1e-4
@@ -76,110 +75,26 @@ class DecisionConfig(_Model):
         return thresholds(self.p0, self.p1)
 
 
-class EverywhereConfig(_Model):
-    """Sees everywhere; the area gives the density of false plots [m^2, in 3-D m^3].
-
-    Simulated false plots fill a square of that area around the origin.
-    """
-
-    shape: Literal["everywhere"]
-    area: Positive
-
-    def build(self, dimensions: int) -> FieldOfView:
-        """The field of view."""
-        return Everywhere(self.area, dimensions)
-
-
-class BoxConfig(_Model):
-    """A box with full side lengths ``size`` [m]; without a center it moves with the sensor."""
-
-    shape: Literal["box"]
-    size: tuple[Positive, ...]
-    center: tuple[Finite, ...] | None = None
-
-    def build(self, dimensions: int) -> FieldOfView:  # noqa: ARG002 (the size tells)
-        """The field of view."""
-        return Box(self.size)
-
-
-class DiscConfig(_Model):
-    """A disc, in 3-D a ball, of ``radius`` [m]; without a center it moves with the sensor."""
-
-    shape: Literal["disc"]
-    radius: Positive
-    center: tuple[Finite, ...] | None = None
-
-    def build(self, dimensions: int) -> FieldOfView:
-        """The field of view."""
-        return Disc(self.radius, dimensions)
-
-
-FieldOfViewConfig: TypeAlias = Annotated[EverywhereConfig | BoxConfig | DiscConfig, Field(discriminator="shape")]
-
-
-class SensorConfig(_Model):
-    """One sensor: where it stands, what it measures, how surely, and when.
-
-    Attributes:
-        sigma: standard deviations of a plot [m].
-        position: east, north (, up) [m]; a recorded scan may override it. Default: the origin.
-        p_d: detection probability inside the field of view.
-        false_plots: mean false plots per scan, uniform in the field of view.
-        scan_interval: seconds between scans.
-        first_scan: time of the first one [s]; default: one interval after the start.
-    """
-
-    name: Name
-    kind: Literal["position"] = "position"
-    position: tuple[Finite, ...] | None = None
-    sigma: tuple[Positive, ...]
-    p_d: Probability
-    false_plots: FalsePlots
-    field_of_view: FieldOfViewConfig
-    scan_interval: Positive = 1.0
-    first_scan: Annotated[NotNegative, WITHIN_RANGE] | None = None
-
-    def build(self, motion: Motion) -> Sensor:
-        """The sensor model for states of a motion model."""
-        return Sensor(
-            Position(self.sigma, motion.n),
-            self.p_d,
-            self.false_plots,
-            self.field_of_view.build(motion.dimensions),
-        )
-
-    def stand(self, dimensions: int, moved_to: tuple[float, ...] | None = None) -> Array:
-        """Where the sensor stands during a scan [m], shape (d,)."""
-        return np.array(moved_to or self.position or (0.0,) * dimensions)
-
-    def view_center(self, stand: Array) -> Array:
-        """Center of the field of view of a sensor that stands at ``stand``, shape (d,)."""
-        fov = self.field_of_view
-        if isinstance(fov, EverywhereConfig):
-            return np.zeros_like(stand)
-        return stand if fov.center is None else np.array(fov.center)
-
-
-class StudyConfig(_Model):
+class StudyConfig(Model):
     """What ``waldnet study`` asks of a track: farther from the truth after the last scan [m], it is lost."""
 
     lost_beyond: Positive = 1000.0
 
 
-class SimulationConfig(_Model):
+class SimulationConfig(Model):
     """The simulated world: how long [s], and the seed of everything random."""
 
     duration: Annotated[Positive, WITHIN_RANGE]
     seed: Count = 1
 
 
-class RecordingConfig(_Model):
+class RecordingConfig(Model):
     """Recorded plots (JSON Lines), path relative to the scenario file."""
 
     plots: Path
 
 
-class TargetConfig(_Model):
+class TargetConfig(Model):
     """A simulated target: a state at its start, or drawn from the density of a hypothesis; it moves as ``motion`` says.
 
     Attributes:
@@ -193,7 +108,7 @@ class TargetConfig(_Model):
     hypothesis: Count | None = None
 
 
-class HypothesisConfig(_Model):
+class HypothesisConfig(Model):
     """A track to be decided on: start [s], mean and standard deviations of a state as ``TargetConfig`` has it."""
 
     start: Seconds = 0.0
@@ -206,7 +121,7 @@ class HypothesisConfig(_Model):
         return Gaussian(np.array(self.state), np.diag(np.square(self.sigma)))
 
 
-class Scenario(_Model):
+class Scenario(Model):
     """One file: a network and, if wanted, the simulated world or the recorded plots it looks at.
 
     Attributes:
@@ -327,7 +242,7 @@ def _describe(detail: ErrorDetails) -> str:
     """One fault as ``path: what was got, what was expected``."""
     # A tagged union puts the tag into the location; it is no key of the file.
     parts = [str(part) for part in detail["loc"]]
-    where = ".".join(part for i, part in enumerate(parts) if i == 0 or parts[i - 1] != "field_of_view" or i < 3)
+    where = ".".join(part for i, part in enumerate(parts) if i == 0 or parts[i - 1] not in _TAGGED or i < 3)
     kind, got, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "missing":
         text = "is missing"
@@ -336,9 +251,9 @@ def _describe(detail: ErrorDetails) -> str:
     elif kind == "literal_error":
         text = f"{got!r} is not one of {context['expected']}"
     elif kind == "union_tag_invalid":
-        text = f"shape {context['tag']!r} is not one of {context['expected_tags']}"
+        text = f"{_TAGGED[parts[-1]]} {context['tag']!r} is not one of {context['expected_tags']}"
     elif kind == "union_tag_not_found":
-        text = "shape is missing"
+        text = f"{_TAGGED[parts[-1]]} is missing"
     elif kind == "value_error":
         text = str(context["error"])
     else:
@@ -355,12 +270,12 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
     sensors, hypotheses = _tables(data, "sensor"), _tables(data, "hypothesis")
     if dimensions in (2, 3):
         for i, sensor in enumerate(sensors):
-            fov = _table(sensor, "field_of_view")
-            yield from _wrong_length(sensor, ("sigma", "position"), dimensions, f"sensor.{i}")
-            yield from _wrong_length(fov, ("size", "center"), dimensions, f"sensor.{i}.field_of_view")
+            yield from sensor_faults(sensor, dimensions, f"sensor.{i}")
+        size = per_axis * dimensions
+        why = f"this scenario's dimensions and motion need {size}"
         for kind in ("hypothesis", "target"):
             for i, entry in enumerate(_tables(data, kind)):
-                yield from _wrong_length(entry, ("state", "sigma"), per_axis * dimensions, f"{kind}.{i}", " and motion")
+                yield from wrong_length(entry, ("state", "sigma"), size, f"{kind}.{i}", why)
     yield from _repeated_names(sensors)
     for i, target in enumerate(_tables(data, "target")):
         drawn = target.get("hypothesis")
@@ -370,6 +285,17 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
             yield f"target.{i}.hypothesis: {drawn} is not one of the {len(hypotheses)} hypotheses (counted from 0)"
     yield from _decision_faults(_table(data, "decision"))
     yield from fusion_faults(_table(data, "fusion"), motion.get("model"))
+    if _table(data, "fusion").get("mode") == "dkf":
+        yield from _dkf_faults(sensors)
+
+
+def _dkf_faults(sensors: list[Mapping[str, Any]]) -> Iterator[str]:
+    """What keeps the covariances of all sensors from being known without data."""
+    for i, sensor in enumerate(sensors):
+        if (kind := sensor.get("kind", "position")) != "position":
+            yield f"fusion.mode: 'dkf' needs covariances known without data; those of sensor.{i}, {kind}, are not"
+        if (model := _table(sensor, "detection").get("model", "constant")) != "constant":
+            yield f"fusion.mode: 'dkf' needs a constant detection probability; sensor.{i} has detection {model!r}"
 
 
 def _table(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
@@ -380,15 +306,6 @@ def _table(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 def _tables(data: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
     value = data.get(key)
     return [entry if isinstance(entry, dict) else {} for entry in value] if isinstance(value, list) else []
-
-
-def _wrong_length(
-    entry: Mapping[str, Any], keys: tuple[str, ...], length: int, where: str, also: str = ""
-) -> Iterator[str]:
-    for key in keys:
-        value = entry.get(key)
-        if isinstance(value, list) and len(value) != length:
-            yield f"{where}.{key}: has {len(value)} numbers, this scenario's dimensions{also} need {length}"
 
 
 def _repeated_names(sensors: list[Mapping[str, Any]]) -> Iterator[str]:

@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.config import Scenario
-from common.estimation.association import Choice, Clutter, Expected, Plots, expect, weigh_and_absorb
+from common.estimation.association import Choice, Clutter, Expected, Plots, expect, weigh_and_absorb, within_reach
+from common.estimation.detection import Notch
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp
 from common.estimation.imm import Imm, Modes, predict_modes
-from common.estimation.mixture import Mixture, Reduction, step, terms
+from common.estimation.mixture import Mixture, Reduction, step, step_with, terms
 from common.estimation.motion import Motion
+from common.estimation.notch import hypotheses, merged
 from common.estimation.representation import Share
 from common.estimation.sensing import Sensor
 
@@ -114,15 +116,33 @@ class LocalFilter:
             stand: where it stands [m], shape (d,).
             center: of its field of view [m], shape (d,).
         """
-        p_d = sensor.detection_probability(Gaussian(density.x[-1], density.P[-1]), stand, center)
+        p_d = sensor.without_notch.detection_probability(Gaussian(density.x[-1], density.P[-1]), stand, center)
         clutter = Clutter(p_d, np.array(sensor.log_rho_f), self.gate_probability)
         return expect(density, sensor.measurement.linearise(density, stand), clutter)
 
-    def update(self, predicted: Mixture, expected: Expected, plots: Plots) -> Mixture:
-        """Filter a scan, which all tracks share (z of shape (M, m)) or not (z of shape (T, 1, M, m))."""
-        if self.choice is None:
+    def update(self, predicted: Mixture, expected: Expected, plots: Plots, sensor: Sensor, stand: Array) -> Mixture:
+        """Filter a scan.
+
+        Args:
+            predicted: the tracks.
+            expected: the same, as the sensor will see them.
+            plots: that all tracks share, z of shape (M, m), or of every track its own, z of shape (T, 1, M, m).
+            sensor: the sensor model.
+            stand: where it stands [m], shape (d,).
+
+        Returns:
+            the tracks after the scan.
+        """
+        plots = plots._replace(log_relative=sensor.log_relative(plots.z, stand))
+        if isinstance(sensor.detection, Notch):
+            given = hypotheses(expected, within_reach(expected, plots), sensor.detection, stand)
+            if self.choice is None:
+                return step_with(predicted, *given, self.reduction)
+            density, log_p_bar, log_q_bar = merged(given, self.choice)
+        elif self.choice is None:
             return step(predicted, expected, plots, self.reduction)
-        density, log_p_bar, log_q_bar = weigh_and_absorb(expected, plots, self.choice)
+        else:
+            density, log_p_bar, log_q_bar = weigh_and_absorb(expected, plots, self.choice)
         if not isinstance(self.motion, Imm):
             return Mixture(predicted.log_w, predicted.log_g + log_p_bar, density)
         log_w = predicted.log_w + np.where(np.isfinite(log_q_bar), log_q_bar, 0.0)

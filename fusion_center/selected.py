@@ -195,7 +195,7 @@ class SelectedFuser:
         density = Gaussian(*(part[:, rows] for part in mixture.density))
         mine = Mixture(mixture.log_w[rows], mixture.log_g[rows], density)
         expected = self.filter.expect(mine.density, sensor, stand, config.view_center(stand))
-        mine = self.filter.update(mine, expected, plots)
+        mine = self.filter.update(mine, expected, plots, sensor, stand)
         if isinstance(rows, slice):
             return mine
         size = max(mixture.log_w.shape[1], mine.log_w.shape[1])

@@ -204,7 +204,7 @@ class LocalTracker:
     def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""
         ready = self._ready(state, look.time_ns, look.position)
-        mixture = self.filter.update(ready.mixture, ready.expected, look.plots)
+        mixture = self._filtered(self.filter, ready.mixture, ready.expected, look)
         filtered = self._with(ready.predicted, mixture)
         tracks = filtered if ready.live.all() else _put(ready.advised, ready.live, filtered)
         advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
@@ -284,7 +284,7 @@ class LocalTracker:
             due = fresh.times_ns < look.time_ns
             if due.any():
                 predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position)
-                filtered = self._with(predicted, self.filter.update(mixture, expected, look.plots))
+                filtered = self._with(predicted, self._filtered(self.filter, mixture, expected, look))
                 fresh = _put(fresh, due, filtered)
         tracks = concatenate(*_alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
@@ -330,7 +330,7 @@ class LocalTracker:
                 prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
                 predicted = honest.predict(prior, _interval(times[due], look.time_ns))
                 expected = self._seen(honest, predicted, look.position)
-                log_w[due], _, ((x_a[due],), (P_a[due],)) = honest.update(predicted, expected, look.plots)
+                log_w[due], _, ((x_a[due],), (P_a[due],)) = self._filtered(honest, predicted, expected, look)
                 times[due] = look.time_ns
         return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times)
 
@@ -351,6 +351,9 @@ class LocalTracker:
 
     def _seen(self, local: LocalFilter, predicted: Mixture, position: Array) -> Expected:
         return local.expect(predicted.density, self.sensor, position, self.config.view_center(position))
+
+    def _filtered(self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look) -> Mixture:
+        return local.update(predicted, expected, look.plots, self.sensor, look.position)
 
     def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
         mixture = self._mixture(tracks)

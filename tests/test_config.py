@@ -253,7 +253,11 @@ FAULTS = [
     ),
     ("scan_interval = 2.0", "scan_interval = 0", "sensor.0.scan_interval: 0 is not positive and finite"),
     ("first_scan = 0.5", "first_scan = -0.5", "sensor.0.first_scan: -0.5 is not zero or positive and finite"),
-    ('kind = "position"', 'kind = "nose"', "sensor.0.kind: 'nose' is not one of 'position'"),
+    (
+        'kind = "position"',
+        'kind = "nose"',
+        "sensor.0.kind: 'nose' is not one of 'position', 'polar', 'polar-doppler' or 'bearing'",
+    ),
     ('name = "radar-2"', 'name = "radar-1"', "sensor.1.name: 'radar-1' is taken already"),
     (
         'name = "radar-2"',
@@ -265,7 +269,7 @@ FAULTS = [
     (
         'shape = "box"',
         'shape = "star"',
-        "sensor.0.field_of_view: shape 'star' is not one of 'everywhere', 'box', 'disc'",
+        "sensor.0.field_of_view: shape 'star' is not one of 'everywhere', 'box', 'disc', 'sector'",
     ),
     ('shape = "box", ', "", "sensor.0.field_of_view: shape is missing"),
     (", size = [4000.0, 3000.0]", "", "sensor.0.field_of_view.size: is missing"),

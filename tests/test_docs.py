@@ -18,6 +18,7 @@ ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 HOW_TO = (ROOT / "docs/how-to/first-network.md").read_text()
 STUDY = (ROOT / "docs/how-to/study.md").read_text()
+SENSORS = (ROOT / "docs/how-to/sensors.md").read_text()
 DEPLOY = (ROOT / "docs/how-to/deploy.md").read_text()
 WALDNET = str(Path(sys.executable).with_name("waldnet"))
 
@@ -75,6 +76,16 @@ def test_how_to_on_one_machine(folder: Path) -> None:
 def test_the_recorded_plots_of_the_how_to_are_valid(folder: Path) -> None:
     (folder / "plots.jsonl").write_text(blocks(HOW_TO, "json")[1])
     assert "2 scans, 2 plots" in run([WALDNET, "check", "harbour.toml", "plots.jsonl"], folder)
+
+
+def test_how_to_of_sensors(tmp_path: Path) -> None:
+    (tmp_path / "hill.toml").write_text(blocks(SENSORS, "toml")[0])
+    (tmp_path / "shown.jsonl").write_text(blocks(SENSORS, "json")[0])
+    check, simulate, replay = commands(SENSORS)
+    assert "4 sensors" in run(check, tmp_path)
+    assert "2 scans, 3 plots" in run([*check, "shown.jsonl"], tmp_path)
+    run(simulate, tmp_path)
+    assert "track 0: confirmed" in run(replay, tmp_path)
 
 
 @pytest.mark.processes

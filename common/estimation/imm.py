@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.estimation.association import Clutter, Plots, pdaf
-from common.estimation.gaussian import Array, Gaussian, log_sum_exp, moments
+from common.estimation.gaussian import Array, Gaussian, draw_noise, log_sum_exp, moments
 from common.estimation.motion import (
     ConstantAcceleration,
     ConstantVelocity,
@@ -361,8 +361,8 @@ def draw_path(motion: Motion, state: Array, intervals_s: Array, rng: np.random.G
 
 def _move(model: Motion, state: Array, seconds: float, rng: np.random.Generator) -> Array:
     dt = np.array(seconds)
-    noise = rng.multivariate_normal(np.zeros(model.n), model.noise(dt), method="svd")
-    return model.transition(dt) @ state + noise
+    moved: Array = model.transition(dt) @ state + draw_noise(rng, model.noise(dt), 1)[0]
+    return moved
 
 
 def _log(probability: Array) -> Array:

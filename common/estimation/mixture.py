@@ -17,7 +17,7 @@ import numpy as np
 from common.estimation.association import Expected, Plots, innovations, within_reach
 from common.estimation.batch import take
 from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array, Gaussian, log_sum_exp, quadratic, squared_norm, symmetric
+from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, quadratic, squared_norm, symmetric
 
 
 class Mixture(NamedTuple):
@@ -95,7 +95,39 @@ def step(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction)
     References:
         theory.md Eq. (15), (17); W. Koch, Tracking and sensor data fusion (2014), §3.3.
     """
-    missed, hit = _missed(prior, expected), _hit(prior, expected, plots)
+    return _chosen(prior, _missed(prior, expected), _hit(prior, expected, plots), reduction)
+
+
+def step_with(prior: Mixture, log_p_star: Array, density: Gaussian, reduction: Reduction) -> Mixture:
+    """``step`` where every hypothesis about the scan has a density of its own.
+
+    Args:
+        prior: predicted to the time of the scan.
+        log_p_star: log p*_j of every component, j = 0 the missed detection, shape (F, T, C, 1 + M).
+        density: of every component under each hypothesis, shapes (F, T, C, 1 + M, n), (F, T, C, 1 + M, n, n).
+        reduction: what may be left.
+
+    Returns:
+        the mixtures after the scan.
+    """
+    alive = (prior.log_w > -np.inf)[..., None] & np.ones(log_p_star.shape[-1], np.bool_)
+    hit = alive & (log_p_star[-1] > -np.inf)
+    hit[..., 0] = False
+    alive[..., 1:] = False
+
+    def branches(which: BoolArray) -> _Branches:
+        at = track, component, hypothesis = np.nonzero(which)
+        x, P = (np.moveaxis(array[:, track, component, hypothesis], 1, 0) for array in density)
+        log_w, log_g = (
+            log[track, component] + weight[at] for log, weight in zip(prior[:2], log_p_star[[-1, 0]], strict=True)
+        )
+        return _Branches(track, log_w, log_g, x, P)
+
+    return _chosen(prior, branches(alive), branches(hit), reduction)
+
+
+def _chosen(prior: Mixture, missed: _Branches, hit: _Branches, reduction: Reduction) -> Mixture:
+    """The mixture of all branches, reduced; there is a missed one for every component that lives."""
     branches = _Branches(*(np.concatenate(pair) for pair in zip(missed, hit, strict=True)))
     # Where h1 holds the scan for impossible (p_d = 1 and no plot in the gate), nothing can be learnt from it.
     best = np.full(len(prior.log_w), -np.inf)

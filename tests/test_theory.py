@@ -533,11 +533,12 @@ def test_advice_however_late_makes_the_association_filter_the_plain_pdaf(delay: 
         scan = Scan("a", scenario.to_ns(look.time), np.zeros(2), look.plots)
         state, _ = tracker.scan(state, scan, NEVER)
         if k > delay:
-            now = {look.time: Entry(0.0, state.tracks.x_a[0], state.tracks.P_a[0])}
+            now = {look.time: Entry(0.0, state.tracks.x_a[0, 0], state.tracks.P_a[0, 0])}
             assert_same(now, {look.time: plain[look.time]._replace(log_lr=0.0)})
         else:
-            assert (np.abs(state.tracks.x_a[0] - plain[look.time].x) > 1e-3).any()
+            assert (np.abs(state.tracks.x_a[0, 0] - plain[look.time].x) > 1e-3).any()
         if k >= delay:
             advised = plain[times[k - delay]]
-            advice = Advice(scenario.to_ns(times[k - delay]), np.zeros(1, np.int64), advised.x[None], advised.P[None])
+            given_ns, time_ns = scenario.to_ns(look.time), scenario.to_ns(times[k - delay])
+            advice = Advice(given_ns, time_ns, np.zeros(1, np.int64), advised.x[None], advised.P[None])
             state = tracker.advise(state, advice)

@@ -322,7 +322,7 @@ class Center:
             return state._replace(first_join_ns=since_ns), []
         first_ns = min(member.next_ns for member in joined)
         start_ns = self.epoch_ns if first_ns == NEVER else first_ns
-        # In lockstep nothing is worked in yet: else nodes would not wait for the feedback of the first measurement time.
+        # In lockstep nothing is worked in yet, or nodes would not wait for the feedback of the first measurement time.
         time_ns = start_ns if self.speed > 0.0 else start_ns - 1
         clock = Clock(time_ns=time_ns, wall_ns=now_ns + _LEAD_NS, speed=self.speed, clear_ns=start_ns)
         return state._replace(clock=clock), [clock]

@@ -70,14 +70,17 @@ def rows(message: Start, *numbers: int) -> Start:
 
 def close(first: Tracks, second: Tracks) -> bool:
     """Whether two nodes keep the same tracks, to rounding; where there is no component any density does."""
-    there = first.log_w > -np.inf
+
+    def kept(tracks: Tracks) -> list[Any]:
+        there = tracks.log_w > -np.inf
+        mixtures = ("log_w", "log_g", "x", "P", "x_a", "P_a")
+        arrays = [array[there] if name in mixtures else array for name, array in tracks._asdict().items()]
+        return [there.sum(axis=-1), *arrays]
+
     return all(
-        np.array_equal(one, other)
-        if one.dtype == np.int64
-        else np.allclose(
-            *((one, other) if one.ndim < 3 or name == "network_P" else (one[there], other[there])), 1e-9, 1e-9
-        )
-        for name, one, other in zip(Tracks._fields, first, second, strict=True)
+        one.shape == other.shape
+        and (np.array_equal(one, other) if one.dtype == np.int64 else np.allclose(one, other, rtol=1e-9, atol=1e-9))
+        for one, other in zip(kept(first), kept(second), strict=True)
     )
 
 

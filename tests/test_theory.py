@@ -1,6 +1,6 @@
 """Whole networks, replayed, against theory.md written out a second time: loops over sensors, plots and tracks.
 
-Nothing of ``common.estimation`` is used here: the reference below comes from the equations.
+Nothing of ``common.estimation`` is used here: the reference below and in ``reference.py`` comes from the equations.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from reference import Array, Density, folded, log_normal, predicted
 from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import chi2, norm
@@ -22,16 +22,10 @@ from sensor_node.tracker import LocalTracker
 from sensor_node.tracker import State as NodeState
 from studies.replay import Replay
 
-Array: TypeAlias = NDArray[np.float64]
 Config: TypeAlias = dict[str, Any]
 
 AREA = 9e6
 PSD = 5.0
-
-
-class Density(NamedTuple):
-    x: Array
-    P: Array
 
 
 class Look(NamedTuple):
@@ -54,37 +48,6 @@ Course: TypeAlias = dict[float, Entry]
 
 
 # ---- the reference
-
-
-def predicted(density: Density, dt: float, psd: float, share: float) -> Density:
-    """Eq. (5): constant velocity, noise of ``share`` times the power spectral density."""
-    d = len(density.x) // 2
-    one, zero = np.eye(d), np.zeros((d, d))
-    F = np.block([[one, dt * one], [zero, one]])
-    Q = psd * np.block([[dt**3 / 3 * one, dt**2 / 2 * one], [dt**2 / 2 * one, dt * one]])
-    return Density(F @ density.x, F @ density.P @ F.T + share * Q)
-
-
-def log_normal(d: Array, S: Array) -> float:
-    """log N(d; 0, S)."""
-    _, log_det = np.linalg.slogdet(2 * np.pi * S)
-    return -0.5 * float(log_det + d @ np.linalg.solve(S, d))
-
-
-def combined(one: Density, other: Density) -> Density:
-    """Eq. (9) of two factors."""
-    J1, J2 = np.linalg.inv(one.P), np.linalg.inv(other.P)
-    P = np.linalg.inv(J1 + J2)
-    return Density(P @ (J1 @ one.x + J2 @ other.x), P)
-
-
-def folded(factors: Sequence[Density]) -> tuple[float, Density]:
-    """Eq. (8) and (9), one sensor after the other."""
-    log_c, fused = 0.0, factors[0]
-    for factor in factors[1:]:
-        log_c += log_normal(factor.x - fused.x, fused.P + factor.P)
-        fused = combined(fused, factor)
-    return log_c, fused
 
 
 def sight(density: Density, sensor: Config) -> float:
@@ -533,11 +496,12 @@ def test_advice_however_late_makes_the_association_filter_the_plain_pdaf(delay: 
         scan = Scan("a", scenario.to_ns(look.time), np.zeros(2), look.plots)
         state, _ = tracker.scan(state, scan, NEVER)
         if k > delay:
-            now = {look.time: Entry(0.0, state.tracks.x_a[0], state.tracks.P_a[0])}
+            now = {look.time: Entry(0.0, state.tracks.x_a[0, 0], state.tracks.P_a[0, 0])}
             assert_same(now, {look.time: plain[look.time]._replace(log_lr=0.0)})
         else:
-            assert (np.abs(state.tracks.x_a[0] - plain[look.time].x) > 1e-3).any()
+            assert (np.abs(state.tracks.x_a[0, 0] - plain[look.time].x) > 1e-3).any()
         if k >= delay:
             advised = plain[times[k - delay]]
-            advice = Advice(scenario.to_ns(times[k - delay]), np.zeros(1, np.int64), advised.x[None], advised.P[None])
+            given_ns, time_ns = scenario.to_ns(look.time), scenario.to_ns(times[k - delay])
+            advice = Advice(given_ns, time_ns, np.zeros(1, np.int64), advised.x[None], advised.P[None])
             state = tracker.advise(state, advice)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import permutations
+from itertools import pairwise, permutations
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,14 @@ from builders import Node, Stage, all_same, hypothesis_table, only, same, scenar
 from process_helpers import assert_agree, points_of
 from reference import Density, folded
 
+from common.codec import encode
 from common.config import Scenario
-from common.messages import NEVER, Advice, Join, Message, Rebase, Report, Scan, Start, Tracks
+from common.memory import MemoryNetwork
+from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Rebase, Report, Scan, Start, Tracks
 from fusion_center.state import Presence
 from scenarios.world import simulate_all
+from sensor_node.shell import NodeShell
+from sensor_node.tracker import LocalTracker
 from studies.network import run_in_memory
 from studies.record import Record
 from studies.replay import Replay
@@ -277,6 +281,16 @@ def test_a_network_that_hears_no_rebase_goes_on_as_without() -> None:
     assert len(deaf.stage.state.told) < len(deaf.rebases)
 
 
+def test_a_network_that_hears_no_more_rebases_goes_on_from_the_last() -> None:
+    """Far longer than the window and what is remembered beyond it."""
+    network = Network(resetting(fusion={"window": 2.0}))
+    for scan in network.scans:
+        network.deaf = {"a", "b"} if seconds(network, scan) > 6.0 else set()
+        network.scan(scan)
+    assert network.stage.state.counts.refused == 0
+    assert all(tracks.contributing.all() for tracks in only(Tracks, network.stage.said))
+
+
 def test_an_old_rebase_is_no_way_back() -> None:
     network = Network(resetting())
     for scan in network.scans[:6]:
@@ -380,6 +394,36 @@ def test_in_lockstep_a_network_with_feedback_is_its_replay(fusion: dict[str, Any
     assert len(replayed.decisions) >= 2
     for _ in range(3):
         assert_agree(points_of(run_in_memory(plot, scans)), points_of(replayed))
+
+
+@pytest.mark.parametrize("feedback", ["reset", "advice"])
+def test_in_lockstep_a_node_waits_for_what_the_center_gives(feedback: str) -> None:
+    """The clock comes on another key, and may overtake it; from the first measurement time on."""
+    plot = scenario(sensor_table("a"), fusion={"feedback": feedback}, decision=UNDECIDED)
+    stage, keys, scans = Stage(plot), Keys("test"), simulate_all(plot, 3)
+    with MemoryNetwork().bus() as bus:
+        shell = NodeShell(bus, plot.network, LocalTracker.of(plot, "a"), scans)
+        shell._open()
+        shell._center_changed(alive=True)
+
+        def hear(messages: Sequence[Message]) -> None:
+            for message in messages:
+                shell._hear(keys.of(message), encode(message))
+
+        node = Node(plot, "a")
+        hear(answers := stage.join("a", 2.0))
+        node.start(*only(Start, answers))
+        for scan, later in pairwise(scans[:4]):
+            assert shell._due_ns() == 0
+            report = node.scan(scan, later.time_ns)
+            shell._process(scan)
+            answers = stage.tell(report)
+            given = [*only(Rebase, answers), *only(Advice, answers)]
+            assert len(given) == 1
+            hear(only(Clock, answers))
+            assert shell._due_ns() is None
+            hear(given)
+            node.state = shell._state
 
 
 def test_advice_may_be_given_later() -> None:

@@ -309,10 +309,11 @@ class Fuser:
         log_a, (x, P) = self._shares(Gaussian(told.x[given], told.P[given]))
         part = take(now, rows) if not isinstance(rows, slice) else now
         total, possible = then.log_lr_total[old], part.log_lr_total > -np.inf
-        gained = np.subtract(total, part.log_lr_total, out=np.zeros_like(total), where=possible)
+        # What confirmations took from log LR since stays taken.
+        taken = np.subtract(part.log_lr_total, part.log_lr, out=np.zeros_like(total), where=possible)
         part = part._replace(
             times_ns=np.full_like(part.times_ns, told.time_ns),
-            log_lr=np.where(possible, part.log_lr + gained, then.log_lr[old]),
+            log_lr=np.where(possible, total - taken, then.log_lr[old]),
             log_lr_total=total,
             log_p_bar=np.zeros_like(part.log_p_bar),
             log_a=log_a,

@@ -213,6 +213,19 @@ def test_a_sensor_that_starts_anew_gets_its_factor_back_as_moments() -> None:
     assert same(back._replace(x=stage.tracks.x, P=stage.tracks.P), back._replace(x=back.x_a, P=back.P_a))
 
 
+def test_terms_that_are_all_impossible_count_alike() -> None:
+    stage = Stage(cluttered())
+    stage.join_all()
+    report = with_terms(stage.report("a", 2.0), 3)
+    stage.tell(report._replace(log_g=np.full(3, -np.inf)))
+    stage.tell(stage.report("b", 2.0))
+    (back,) = only(Start, stage.join("a", 4.0, incarnation=2))
+    moments = mean_of(np.zeros(3).tolist(), [Density(*term) for term in zip(report.x, report.P, strict=True)])
+    np.testing.assert_allclose(back.x[0], moments.x, rtol=1e-12)
+    np.testing.assert_allclose(back.P[0], moments.P, rtol=1e-12, atol=1e-9)
+    assert back.log_p_bar.tolist() == stage.tracks.log_lr_total.tolist() == [-np.inf]
+
+
 def test_a_center_whose_tracks_are_all_gone_goes_on() -> None:
     stage = Stage(cluttered(decision={"enabled": True}))
     stage.join_all()

@@ -139,8 +139,40 @@ def reference(network: Config, hypothesis: Config, looks: Sequence[Look]) -> Cou
         log_c, fused = folded(factors)
         log_lr += log_c
         now, course[time] = time, Entry(log_lr, *fused)
-        if fusion["feedback"] == "advice":
+        if fusion["feedback"] != "none":
             honest = [fused for _ in sensors]
+        if fusion["feedback"] == "reset":
+            factors = [Density(fused.x, share * fused.P) for _ in sensors]
+    return course
+
+
+def reset_late(network: Config, hypothesis: Config, looks: Sequence[Look], delay: float) -> Course:
+    """One track where, after every measurement time, all begin anew from the fused track of ``delay`` seconds before.
+
+    All sensors scan at the same times.
+    """
+    sensors, fusion, psd = network["sensor"], network["fusion"], float(network["motion"]["psd"])
+    share, start = float(len(sensors)), float(hypothesis["start"])
+    # While nothing is old enough nothing begins anew.
+    course = reference(network | {"fusion": fusion | {"feedback": "none"}}, hypothesis, looks)
+    for last, time in pairwise(course):
+        since = max((past for past in course if past <= last - delay), default=start)
+        if since == start:
+            continue
+        log_lr, *fused = course[since]
+        begun = Density(fused[0], share * fused[1])
+        factors, evidence = [], 0.0
+        for s in range(len(sensors)):
+            factor, honest, now = begun, Density(*fused), since
+            for look in (look for look in looks if look.sensor == s and since < look.time <= time):
+                factor = predicted(factor, look.time - now, psd, share)
+                honest = predicted(honest, look.time - now, psd, 1.0)
+                factor, honest, log_p_bar = filtered(factor, honest, look.plots, sensors[s], fusion)
+                now, evidence = look.time, evidence + log_p_bar
+            factors.append(factor)
+        before, _ = folded([predicted(begun, time - since, psd, share)] * len(sensors))
+        after, density = folded(factors)
+        course[time] = Entry(log_lr + evidence + after - before, *density)
     return course
 
 
@@ -276,7 +308,7 @@ def last(course: Course) -> Entry:
 
 
 @pytest.mark.parametrize("gate_probability", [1.0, 0.9])
-@pytest.mark.parametrize("feedback", ["none", "advice"])
+@pytest.mark.parametrize("feedback", ["none", "advice", "reset"])
 @pytest.mark.parametrize("association", ["factor", "tight"])
 @pytest.mark.parametrize("mode", ["naive", "federated"])
 def test_a_network_is_what_the_equations_say(
@@ -328,6 +360,22 @@ def test_the_variants_of_a_network_differ() -> None:
     assert all(abs(other - plain) > 0.01 for other in others)
 
 
+@pytest.mark.parametrize("delay", [0.0, 2.0, 4.0])
+@pytest.mark.parametrize("association", ["factor", "tight"])
+def test_a_network_that_begins_anew_from_what_was_some_time_ago(association: str, delay: float) -> None:
+    """All sensors scan together, so that every rebase is followed by everyone's evidence since."""
+    network = three_radars(association=association, feedback="reset", feedback_delay=delay)
+    network["hypothesis"] = network["hypothesis"][:2]
+    times = (1.0, 2.0, 3.5, 5.0, 7.0, 8.0, 10.0)
+    looks, few = [], cluttered(network)
+    for s in range(3):
+        own = [look for look in few if look.sensor == s]
+        looks += [look._replace(time=time) for look, time in zip(own, times, strict=False)]
+    ours = courses(network, looks)
+    for track, hypothesis in enumerate(network["hypothesis"]):
+        assert_same(ours[track], reset_late(network, hypothesis, looks, delay))
+
+
 UNLIKE = [((50.0, 50.0), 1.0, 1.0), ((10.0, 80.0), 1.0, 1.0), ((300.0, 20.0), 1.0, 1.0)]
 ASYNCHRONOUS = [((50.0, 50.0), 1.0, 1.0), ((10.0, 80.0), 0.25, 1.75), ((300.0, 20.0), 3.0, 0.5)]
 ALIKE = [((50.0, 50.0), 1.0, 1.0)] * 4
@@ -342,6 +390,22 @@ def test_without_doubt_the_network_is_the_centralised_kalman_filter(
 ) -> None:
     """For the target's track, for the decoy, which is drawn onto the target, and for those that begin late."""
     network, looks = one_plot_each(sensors, mode=mode, association=association)
+    ours = courses(network, looks)
+    for track, hypothesis in enumerate(network["hypothesis"]):
+        assert_same(ours[track], kalman(network, hypothesis, looks))
+
+
+@pytest.mark.parametrize("association", ["factor", "tight", "mirrored"])
+@pytest.mark.parametrize("sensors", [UNLIKE, ASYNCHRONOUS, ALIKE], ids=["unlike", "asynchronous", "alike"])
+def test_without_doubt_a_network_that_begins_anew_is_the_centralised_kalman_filter(
+    sensors: list[tuple[tuple[float, float], float, float]], association: str
+) -> None:
+    """However unlike the sensors are.
+
+    The federated prediction is exact for factors that are alike: n factors N(x, n P) become N(F x, n (F P F' + Q)), the
+    roots of the predicted density. After every scan the reset makes them so, from the exact posterior.
+    """
+    network, looks = one_plot_each(sensors, association=association, feedback="reset")
     ours = courses(network, looks)
     for track, hypothesis in enumerate(network["hypothesis"]):
         assert_same(ours[track], kalman(network, hypothesis, looks))

@@ -20,6 +20,7 @@ from common.messages import (
     Join,
     Keys,
     Message,
+    Picked,
     Proposal,
     Rebase,
     Report,
@@ -112,6 +113,24 @@ def proposal(tracks: int, n: int = 4) -> Proposal:
     return Proposal("radar-1", EPOCH_NS, rng.standard_normal((tracks, n)), covariances(rng, tracks, n))
 
 
+def picked(tracks: int, plots: int, m: int = 2) -> Picked:
+    """Plot i goes to every track whose number is no multiple of i + 2."""
+    rng = np.random.default_rng(tracks)
+    which = [np.flatnonzero(track % np.arange(2, plots + 2)) for track in range(tracks)]
+    return Picked(
+        sensor="radar-1",
+        sequence=3,
+        time_ns=EPOCH_NS,
+        next_ns=EPOCH_NS + 1,
+        epoch=1,
+        position=rng.standard_normal(m),
+        ids=ids(tracks),
+        plots=np.array([len(own) for own in which], np.int64),
+        which=np.concatenate([np.empty(0, np.int64), *which]),
+        z=rng.standard_normal((plots, m)).astype(np.float32).astype(np.float64),
+    )
+
+
 def rounded(message: Report) -> Report:
     """A report whose densities fit into single precision."""
     x, P = (array.astype(np.float32).astype(np.float64) for array in (message.x, message.P))
@@ -125,6 +144,8 @@ MESSAGES: dict[str, Message] = {
     "report-mixed-terms": report(1, terms=6)._replace(ids=ids(3), terms=np.array([1, 2, 3])),
     "report-impossible": report(2)._replace(log_g=np.array([-np.inf, -1.0])),
     "report-last": report(1)._replace(next_ns=NEVER),
+    **{f"picked-{t}-{m}": picked(t, m) for t, m in ((0, 0), (1, 0), (1, 3), (100, 7))},
+    "picked-3d": picked(3, 4, m=3),
     **{f"scan-{m}": scan(m) for m in (0, 1, 100)},
     "scan-3d": scan(2, d=3),
     **{f"proposal-{t}": proposal(t) for t in (0, 1, 100)},
@@ -546,6 +567,7 @@ def test_every_message_has_its_key() -> None:
     keys = {type(message).__name__: KEYS.of(message) for message in MESSAGES.values()}
     assert keys == {
         "Report": "waldnet/coast/sensor/radar-1/report",
+        "Picked": "waldnet/coast/sensor/radar-1/report",
         "Scan": "waldnet/coast/sensor/radar-1/plots",
         "Proposal": "waldnet/coast/sensor/radar-1/proposal",
         "Join": "waldnet/coast/sensor/radar-1/join",
@@ -575,3 +597,23 @@ def test_every_message_has_its_key() -> None:
 )
 def test_the_sensor_of_a_key(key: str, sensor: str) -> None:
     assert sensor_of(key) == sensor
+
+
+def test_picked_plots_are_rounded_on_request() -> None:
+    message = picked(3, 4)
+    payload = encode(message, rounded=True)
+    assert same(decode(KEYS.report("radar-1"), payload), message)  # they fit into single precision
+    assert len(encode(message)) - len(payload) == 4 * message.z.size
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"plots": np.array([3])}, "3 plots of tracks, 2 places sent among 2 plots"),
+        ({"which": np.array([0, 2])}, "2 plots of tracks, 2 places sent among 2 plots"),
+    ],
+)
+def test_plots_that_are_not_there_are_refused(changes: dict[str, Any], fault: str) -> None:
+    message = picked(1, 2)._replace(plots=np.array([2]), which=np.array([0, 1]), z=np.zeros((2, 2)))
+    with pytest.raises(DecodeError, match=fault):
+        decode(KEYS.report("radar-1"), encode(message._replace(**changes)))

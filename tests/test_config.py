@@ -217,7 +217,11 @@ FAULTS = [
     ("p0 = 1e-3", "p0 = 0.9", "decision.p1: 0.9 is not above p0 = 0.9; no threshold lies between"),
     ("p1 = 0.9", "p1 = 1e-4", "decision.p1: 0.0001 is not above p0 = 0.001; no threshold lies between"),
     # fusion
-    ('mode = "federated"', 'mode = "best"', "fusion.mode: 'best' is not one of 'naive', 'federated' or 'dkf'"),
+    (
+        'mode = "federated"',
+        'mode = "best"',
+        "fusion.mode: 'best' is not one of 'naive', 'federated', 'dkf' or 'selected'",
+    ),
     (
         'association = "tight"\nfeedback = "advice"',
         'association = "loose"',

@@ -15,7 +15,7 @@ from reference import Density, folded
 from common.codec import encode
 from common.config import Scenario
 from common.memory import MemoryNetwork
-from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Rebase, Report, Scan, Start, Tracks
+from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Rebase, Report, Scan, Start, Stop, Tracks
 from fusion_center.state import Presence
 from scenarios.world import simulate_all
 from sensor_node.shell import NodeShell
@@ -298,6 +298,30 @@ def test_an_old_rebase_is_no_way_back() -> None:
     node = network.nodes["a"]
     for rebase in network.rebases:
         assert node.tracker.rebase(node.state, rebase) is node.state
+
+
+def test_a_rebase_raises_no_track_that_the_node_does_not_keep() -> None:
+    """A rebase of a while ago may tell of tracks that were stopped since."""
+    network = Network(resetting(hypothesis=[hypothesis_table(), hypothesis_table(500.0)]))
+    for scan in network.scans[:2]:
+        network.scan(scan)
+    node, told = network.nodes["a"], network.rebases[-1]
+    stopped = node.tracker.stop(node.state, Stop("a", np.array([1])))
+    again = node.tracker.rebase(stopped, told._replace(epoch=told.epoch + 1))
+    assert again.tracks.ids.tolist() == [0]
+    assert again.epoch == told.epoch + 1
+
+
+def test_a_track_that_a_rebase_does_not_name_keeps_its_factor() -> None:
+    network = Network(resetting(hypothesis=[hypothesis_table(), hypothesis_table(500.0)]))
+    for scan in network.scans[:3]:
+        network.scan(scan)
+    node, told = network.nodes["a"], network.rebases[-1]
+    one = told._replace(epoch=told.epoch + 1, ids=told.ids[:1], x=told.x[:1] + 1.0, P=told.P[:1])
+    tracks = node.tracker.rebase(node.state, one).tracks
+    assert not np.array_equal(tracks.x[0], node.state.tracks.x[0])
+    for field in ("times_ns", "log_g", "x", "P", "x_a", "P_a"):
+        assert np.array_equal(getattr(tracks, field)[1], getattr(node.state.tracks, field)[1])
 
 
 def test_a_late_rebase_is_as_good_as_one_in_time() -> None:

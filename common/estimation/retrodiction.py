@@ -75,7 +75,8 @@ def generation(mixture: Mixture, ancestry: Ancestry, F: Array, Q: Array) -> Gene
     Args:
         mixture: after ``mixture.step_traced``.
         ancestry: from there.
-        F, Q: with which it was predicted, see ``Generation``.
+        F: transition with which it was predicted, see ``Generation``.
+        Q: process noise, likewise.
     """
     x, P = mixture.density
     return Generation(mixture.log_w, Gaussian(x[-1], P[-1]), ancestry, F, Q)
@@ -173,9 +174,7 @@ def _before(later: Histories, now: Generation, before: Generation) -> Histories:
     row = np.repeat(first - np.cumsum(counts) + counts, counts) + np.arange(counts.sum())
     track, parent = ancestry.track[row], ancestry.parent[row]
     filtered = Gaussian(before.density.x[track, parent], before.density.P[track, parent])
-    density = backward(
-        filtered, _of(now.F, track), _of(now.Q, track), Gaussian(later.density.x[son], later.density.P[son])
-    )
+    density = backward(filtered, *_moved(now, track), Gaussian(later.density.x[son], later.density.P[son]))
     return Histories(track, parent, later.log_w[son] + ancestry.log_share[row], density)
 
 
@@ -211,7 +210,7 @@ def _fathers(later: Retrodicted, now: Generation, before: Generation) -> Retrodi
     track, component, parent, log_w = track[order], component[order], parent[order], log_w[order]
     filtered = Gaussian(before.density.x[track, parent], before.density.P[track, parent])
     sons = Gaussian(later.density.x[track, component], later.density.P[track, component])
-    x, P = backward(filtered, _of(now.F, track), _of(now.Q, track), sons)
+    x, P = backward(filtered, *_moved(now, track), sons)
     first = np.flatnonzero(np.diff(track * before.log_w.shape[1] + parent, prepend=-1))
     total = np.logaddexp.reduceat(log_w, first)
     lengths = np.diff(first, append=len(track))
@@ -231,6 +230,7 @@ def _fathers(later: Retrodicted, now: Generation, before: Generation) -> Retrodi
     return result
 
 
-def _of(matrix: Array, track: IntArray) -> Array:
-    """The matrix of each row's track, shape (n, n) or (T, n, n) to (n, n) or (N, n, n)."""
-    return matrix[track] if len(matrix.shape) > 2 else matrix
+def _moved(now: Generation, track: IntArray) -> tuple[Array, Array]:
+    """F and Q of each row's track, shapes (N, n, n)."""
+    shape = (len(now.log_w), *now.F.shape[-2:])
+    return np.broadcast_to(now.F, shape)[track], np.broadcast_to(now.Q, shape)[track]

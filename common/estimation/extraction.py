@@ -197,15 +197,26 @@ def extract(
     Raises:
         ValueError: when a scan is older than the one before.
     """
-    now, given = start_time, start
-    for scan in scans:
-        if scan.time < now:
-            raise ValueError(f"a scan at {scan.time} s comes after one at {now} s: scans by time are needed")
-        given = extractor.step(extractor.predict(given, scan.time - now), scan)
-        now = scan.time
+    given = start
+    for interval, scan in in_order(start_time, scans):
+        given = extractor.step(extractor.predict(given, interval), scan)
         yield given
         if (given.status == DELETED).all():
             return
+
+
+def in_order(start_time: float, scans: Iterable[SensorScan]) -> Iterator[tuple[float, SensorScan]]:
+    """Scans, and the time since the one before [s].
+
+    Raises:
+        ValueError: when a scan is older than the one before.
+    """
+    now = start_time
+    for scan in scans:
+        if scan.time < now:
+            raise ValueError(f"a scan at {scan.time} s comes after one at {now} s: scans by time are needed")
+        yield scan.time - now, scan
+        now = scan.time
 
 
 def _of(plots: Plots, rows: BoolArray) -> Plots:

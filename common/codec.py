@@ -25,6 +25,7 @@ from common.messages import (
     DecisionKind,
     Join,
     Message,
+    Picked,
     Proposal,
     Rebase,
     Report,
@@ -60,9 +61,10 @@ def _floats(field: str, *axes: str) -> Block:
 
 _IDS = Block("ids", "<u4", ("T",), "i8")
 _TERMS = Block("terms", "u1", ("T",), "i8")
+_PICKED = (Block("plots", "<u2", ("T",), "i8"), Block("which", "<u2", ("N",), "i8"))
 
-#: Kind of a report whose densities are rounded; log g, which grows without end, is not.
-ROUNDED = 10
+#: Kinds of reports whose densities or plots are rounded; log g, which grows without end, is not.
+ROUNDED, ROUNDED_PLOTS = 10, 14
 
 #: Blocks of every kind of message; the number is the kind on the wire.
 LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
@@ -103,13 +105,16 @@ LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
     ),
     9: (Decision, ()),
     11: (Proposal, (_floats("x", "T", "n"), _floats("P", "T", "n^"))),
+    13: (Picked, (_floats("position", "d"), _IDS, *_PICKED, _floats("z", "M", "m"))),
+    ROUNDED_PLOTS: (Picked, (_floats("position", "d"), _IDS, *_PICKED, Block("z", "<f4", ("M", "m")))),
     12: (Rebase, (_IDS, _floats("x", "T", "n"), _floats("P", "T", "n^"))),
 }
-_KINDS = {message: kind for kind, (message, _) in LAYOUTS.items() if kind != ROUNDED}
+_KINDS = {message: kind for kind, (message, _) in LAYOUTS.items() if kind not in (ROUNDED, ROUNDED_PLOTS)}
+_ROUNDED = {Report: ROUNDED, Picked: ROUNDED_PLOTS}
 #: No state is larger; keeps a forged header from asking for memory.
 _MAX_STATE = 64
 #: Messages whose sensor is the one in the key.
-_KEYED = (Report, Scan, Join, Start, Stop, Proposal)
+_KEYED = (Report, Picked, Scan, Join, Start, Stop, Proposal)
 
 _TO_WIRE: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "str": str, "tuple": list}
 _EXPECTED = {"int": "a 64-bit integer", "float": "a finite float", "str": "a text", "tuple": "an array of texts"}
@@ -122,12 +127,14 @@ def encode(message: Message, *, rounded: bool = False) -> bytes:
 
     Args:
         message: to send.
-        rounded: send the densities of a report in single precision.
+        rounded: send the densities or plots of a report in single precision.
 
     Returns:
         the payload; the name of the sensor it comes from or goes to is in the key instead.
     """
-    kind = ROUNDED if rounded and isinstance(message, Report) else _KINDS[type(message)]
+    kind = _KINDS[type(message)]
+    if rounded:
+        kind = _ROUNDED.get(type(message), kind)
     sizes: dict[str, int] = {}
     raw = []
     for block in LAYOUTS[kind][1]:
@@ -285,6 +292,8 @@ def _check_counts(message: Message) -> None:
     match message:
         case Report(terms=terms, log_g=log_g) if (terms < 1).any() or terms.sum() != len(log_g):
             raise DecodeError(f"{int(terms.sum())} terms of tracks, {len(log_g)} terms sent")
+        case Picked(plots=plots, which=which, z=z) if plots.sum() != len(which) or (which >= len(z)).any():
+            raise DecodeError(f"{int(plots.sum())} plots of tracks, {len(which)} places sent among {len(z)} plots")
         case Tracks(contributing=who, sensors=names) if who.shape[1] != len(names):
             raise DecodeError(f"{who.shape[1]} contributing sensors, {len(names)} names")
         case Tracks(status=status) if (status > max(Status)).any():

@@ -7,45 +7,41 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from pydantic_core import ErrorDetails
 
 from common.errors import ConfigError
-from common.estimation.association import Choice, kalman, nearest, normalise
-from common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.mixture import Reduction
-from common.estimation.motion import ConstantVelocity, Motion
+from common.estimation.gaussian import Gaussian
 from common.estimation.representation import Share
-from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import Thresholds, thresholds
+from common.fusion_config import FusionConfig, fusion_faults
+from common.motion_config import MotionConfig, motion_faults, numbers_per_axis
 from common.quantities import (
     NS_PER_S,
     WITHIN_RANGE,
     Count,
-    FalsePlots,
     Finite,
-    GateProbability,
     InnerProbability,
     Instant,
+    Model,
     Name,
-    NotNegative,
     Positive,
-    Probability,
     Seconds,
 )
+from common.sensor_config import BoxConfig as BoxConfig
+from common.sensor_config import DiscConfig as DiscConfig
+from common.sensor_config import SectorConfig as SectorConfig
+from common.sensor_config import SensorConfig as SensorConfig
+from common.sensor_config import sensor_faults, wrong_length
 
-CHOICES: dict[str, Choice] = {"kalman": kalman, "nearest": nearest, "pdaf": normalise}
+#: Tables that come in kinds, and the key that tells which.
+_TAGGED = {"field_of_view": "shape", "detection": "model"}
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-class Network(_Model):
+class Network(Model):
     """How one process takes part in a Zenoh network; endpoints look like ``tcp/192.168.1.7:7447``.
 
     ``link_bit_s`` is the rate of its slowest link, where that is below some Mbit/s: reports then overtake plots there.
@@ -59,26 +55,14 @@ class Network(_Model):
     link_bit_s: Positive | None = None
 
 
-class Origin(_Model):
+class Origin(Model):
     """Origin of the local east-north frame."""
 
     latitude: Annotated[float, Field(ge=-90.0, le=90.0, strict=True)]
     longitude: Annotated[float, Field(ge=-180.0, le=180.0, strict=True)]
 
 
-class MotionConfig(_Model):
-    """How targets move; psd in m^2/s^3."""
-
-    model: Literal["cv"] = "cv"
-    dimensions: Literal[2, 3] = 2
-    psd: NotNegative
-
-    def build(self) -> Motion:
-        """The motion model."""
-        return ConstantVelocity(self.dimensions, self.psd)
-
-
-class DecisionConfig(_Model):
+class DecisionConfig(Model):
     """Wald's test: p0 accept h1 under h0, p1 accept h1 under h1; not enabled, LR is computed and nothing decided."""
 
     p0: InnerProbability = 1e-4
@@ -91,164 +75,31 @@ class DecisionConfig(_Model):
         return thresholds(self.p0, self.p1)
 
 
-class MixtureConfig(_Model):
-    """How far the mixture of a track may grow (theory.md §9).
+class StudyConfig(Model):
+    """What ``waldnet study`` asks of a track: farther from the truth after the last scan [m], it is lost."""
 
-    Attributes:
-        components: most components of a track.
-        prune: hypotheses lighter than this share of the heaviest are dropped.
-        combine: hypotheses closer than this to a heavier one (squared Mahalanobis distance) are combined with it.
-    """
-
-    components: Annotated[int, Field(ge=1, le=1000, strict=True)] = 15
-    prune: Annotated[NotNegative, Field(lt=1.0)] = 1e-4
-    combine: NotNegative = 0.5
-
-    def build(self) -> Reduction:
-        """The reduction of mixtures."""
-        return Reduction(self.components, self.prune, self.combine)
+    lost_beyond: Positive = 1000.0
 
 
-class FusionConfig(_Model):
-    """How the network shares a density and who associates.
-
-    Attributes:
-        mode: representation of the product (theory.md §4).
-        association: the factor's own, tight, or mirrored: hypotheses kept in both filters (theory.md §5).
-        terms: most terms of a track in a report; more than one only where association is mirrored.
-        feedback: advice gives the fused track back to the association filters, reset to the factors (theory.md §3, 6).
-        feedback_delay: measurement time that goes by before the center gives feedback [s], to study slow links.
-        filter: local filter; default: mht where association is mirrored, else pdaf.
-        mixture: of filter mht.
-        precision: of means and covariances in reports; float32 halves them.
-        gate_probability: that the target's plot lies inside the gate; 1 is no gate.
-        hold_back: how long the center waits for a sensor that is overdue [s].
-        window: how far back a late report is still worked in [s of measurement time].
-    """
-
-    mode: Literal["naive", "federated", "dkf"] = "federated"
-    association: Literal["factor", "tight", "mirrored"] = "tight"
-    terms: Annotated[int, Field(ge=1, le=64, strict=True)] = 1
-    feedback: Literal["none", "advice", "reset"] = "none"
-    feedback_delay: NotNegative = 0.0
-    filter: Literal["kalman", "nearest", "pdaf", "mht"] | None = None
-    mixture: MixtureConfig = MixtureConfig()
-    precision: Literal["float64", "float32"] = "float64"
-    gate_probability: GateProbability = 0.9997
-    hold_back: NotNegative = 0.5
-    window: NotNegative = 10.0
-
-    @property
-    def choice(self) -> Choice | None:
-        """How a single Gaussian is associated; None: hypotheses are kept in a mixture."""
-        if self.association == "mirrored" or self.filter == "mht":
-            return None
-        return CHOICES[self.filter or "pdaf"]
-
-
-class EverywhereConfig(_Model):
-    """Sees everywhere; the area gives the density of false plots [m^2, in 3-D m^3].
-
-    Simulated false plots fill a square of that area around the origin.
-    """
-
-    shape: Literal["everywhere"]
-    area: Positive
-
-    def build(self, dimensions: int) -> FieldOfView:
-        """The field of view."""
-        return Everywhere(self.area, dimensions)
-
-
-class BoxConfig(_Model):
-    """A box with full side lengths ``size`` [m]; without a center it moves with the sensor."""
-
-    shape: Literal["box"]
-    size: tuple[Positive, ...]
-    center: tuple[Finite, ...] | None = None
-
-    def build(self, dimensions: int) -> FieldOfView:  # noqa: ARG002 (the size tells)
-        """The field of view."""
-        return Box(self.size)
-
-
-class DiscConfig(_Model):
-    """A disc, in 3-D a ball, of ``radius`` [m]; without a center it moves with the sensor."""
-
-    shape: Literal["disc"]
-    radius: Positive
-    center: tuple[Finite, ...] | None = None
-
-    def build(self, dimensions: int) -> FieldOfView:
-        """The field of view."""
-        return Disc(self.radius, dimensions)
-
-
-FieldOfViewConfig: TypeAlias = Annotated[EverywhereConfig | BoxConfig | DiscConfig, Field(discriminator="shape")]
-
-
-class SensorConfig(_Model):
-    """One sensor: where it stands, what it measures, how surely, and when.
-
-    Attributes:
-        sigma: standard deviations of a plot [m].
-        position: east, north (, up) [m]; a recorded scan may override it. Default: the origin.
-        p_d: detection probability inside the field of view.
-        false_plots: mean false plots per scan, uniform in the field of view.
-        scan_interval: seconds between scans.
-        first_scan: time of the first one [s]; default: one interval after the start.
-    """
-
-    name: Name
-    kind: Literal["position"] = "position"
-    position: tuple[Finite, ...] | None = None
-    sigma: tuple[Positive, ...]
-    p_d: Probability
-    false_plots: FalsePlots
-    field_of_view: FieldOfViewConfig
-    scan_interval: Positive = 1.0
-    first_scan: Annotated[NotNegative, WITHIN_RANGE] | None = None
-
-    def build(self, motion: Motion) -> Sensor:
-        """The sensor model for states of a motion model."""
-        return Sensor(
-            Position(self.sigma, motion.n),
-            self.p_d,
-            self.false_plots,
-            self.field_of_view.build(motion.dimensions),
-        )
-
-    def stand(self, dimensions: int, moved_to: tuple[float, ...] | None = None) -> Array:
-        """Where the sensor stands during a scan [m], shape (d,)."""
-        return np.array(moved_to or self.position or (0.0,) * dimensions)
-
-    def view_center(self, stand: Array) -> Array:
-        """Center of the field of view of a sensor that stands at ``stand``, shape (d,)."""
-        fov = self.field_of_view
-        if isinstance(fov, EverywhereConfig):
-            return np.zeros_like(stand)
-        return stand if fov.center is None else np.array(fov.center)
-
-
-class SimulationConfig(_Model):
+class SimulationConfig(Model):
     """The simulated world: how long [s], and the seed of everything random."""
 
     duration: Annotated[Positive, WITHIN_RANGE]
     seed: Count = 1
 
 
-class RecordingConfig(_Model):
+class RecordingConfig(Model):
     """Recorded plots (JSON Lines), path relative to the scenario file."""
 
     plots: Path
 
 
-class TargetConfig(_Model):
+class TargetConfig(Model):
     """A simulated target: a state at its start, or drawn from the density of a hypothesis; it moves as ``motion`` says.
 
     Attributes:
         start: when it appears [s].
-        state: position and velocity [m, m/s].
+        state: position and velocity [m, m/s]; where targets accelerate, acceleration too [m/s^2].
         hypothesis: index of the hypothesis whose density it is drawn from.
     """
 
@@ -257,8 +108,8 @@ class TargetConfig(_Model):
     hypothesis: Count | None = None
 
 
-class HypothesisConfig(_Model):
-    """A track to be decided on: start [s], mean and standard deviations of position and velocity [m, m/s]."""
+class HypothesisConfig(Model):
+    """A track to be decided on: start [s], mean and standard deviations of a state as ``TargetConfig`` has it."""
 
     start: Seconds = 0.0
     state: tuple[Finite, ...]
@@ -270,7 +121,7 @@ class HypothesisConfig(_Model):
         return Gaussian(np.array(self.state), np.diag(np.square(self.sigma)))
 
 
-class Scenario(_Model):
+class Scenario(Model):
     """One file: a network and, if wanted, the simulated world or the recorded plots it looks at.
 
     Attributes:
@@ -286,6 +137,7 @@ class Scenario(_Model):
     fusion: FusionConfig = FusionConfig()
     sensors: Annotated[tuple[SensorConfig, ...], Field(alias="sensor", min_length=1)]
     simulation: SimulationConfig | None = None
+    study: StudyConfig = StudyConfig()
     recording: RecordingConfig | None = None
     targets: Annotated[tuple[TargetConfig, ...], Field(alias="target")] = ()
     hypotheses: Annotated[tuple[HypothesisConfig, ...], Field(alias="hypothesis")] = ()
@@ -329,7 +181,7 @@ class Scenario(_Model):
     @property
     def share(self) -> Share:
         """A sensor's share of prior and process noise."""
-        return Share(1.0 if self.fusion.mode == "naive" else float(len(self.sensors)))
+        return Share(1.0 if self.fusion.mode in ("naive", "selected") else float(len(self.sensors)))
 
 
 def load_scenario(path: Path) -> Scenario:
@@ -390,7 +242,7 @@ def _describe(detail: ErrorDetails) -> str:
     """One fault as ``path: what was got, what was expected``."""
     # A tagged union puts the tag into the location; it is no key of the file.
     parts = [str(part) for part in detail["loc"]]
-    where = ".".join(part for i, part in enumerate(parts) if i == 0 or parts[i - 1] != "field_of_view" or i < 3)
+    where = ".".join(part for i, part in enumerate(parts) if i == 0 or parts[i - 1] not in _TAGGED or i < 3)
     kind, got, context = detail["type"], detail["input"], detail.get("ctx", {})
     if kind == "missing":
         text = "is missing"
@@ -399,9 +251,9 @@ def _describe(detail: ErrorDetails) -> str:
     elif kind == "literal_error":
         text = f"{got!r} is not one of {context['expected']}"
     elif kind == "union_tag_invalid":
-        text = f"shape {context['tag']!r} is not one of {context['expected_tags']}"
+        text = f"{_TAGGED[parts[-1]]} {context['tag']!r} is not one of {context['expected_tags']}"
     elif kind == "union_tag_not_found":
-        text = "shape is missing"
+        text = f"{_TAGGED[parts[-1]]} is missing"
     elif kind == "value_error":
         text = str(context["error"])
     else:
@@ -412,16 +264,18 @@ def _describe(detail: ErrorDetails) -> str:
 
 def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
     """Faults between keys; tolerant of whatever else is wrong, so that all faults are named at once."""
-    dimensions = _table(data, "motion").get("dimensions", 2)
+    motion = _table(data, "motion")
+    yield from motion_faults(data.get("motion"))
+    dimensions, per_axis = motion.get("dimensions", 2), numbers_per_axis(motion)
     sensors, hypotheses = _tables(data, "sensor"), _tables(data, "hypothesis")
     if dimensions in (2, 3):
         for i, sensor in enumerate(sensors):
-            fov = _table(sensor, "field_of_view")
-            yield from _wrong_length(sensor, ("sigma", "position"), dimensions, f"sensor.{i}")
-            yield from _wrong_length(fov, ("size", "center"), dimensions, f"sensor.{i}.field_of_view")
+            yield from sensor_faults(sensor, dimensions, f"sensor.{i}")
+        size = per_axis * dimensions
+        why = f"this scenario's dimensions and motion need {size}"
         for kind in ("hypothesis", "target"):
             for i, entry in enumerate(_tables(data, kind)):
-                yield from _wrong_length(entry, ("state", "sigma"), 2 * dimensions, f"{kind}.{i}")
+                yield from wrong_length(entry, ("state", "sigma"), size, f"{kind}.{i}", why)
     yield from _repeated_names(sensors)
     for i, target in enumerate(_tables(data, "target")):
         drawn = target.get("hypothesis")
@@ -430,29 +284,18 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
         elif isinstance(drawn, int) and drawn >= len(hypotheses):
             yield f"target.{i}.hypothesis: {drawn} is not one of the {len(hypotheses)} hypotheses (counted from 0)"
     yield from _decision_faults(_table(data, "decision"))
-    yield from _fusion_faults(_table(data, "fusion"))
+    yield from fusion_faults(_table(data, "fusion"), motion.get("model"))
+    if _table(data, "fusion").get("mode") == "dkf":
+        yield from _dkf_faults(sensors)
 
 
-def _fusion_faults(fusion: Mapping[str, Any]) -> Iterator[str]:
-    mode, association, filter_ = (
-        fusion.get(key, default) for key, default in (("mode", "federated"), ("association", "tight"), ("filter", None))
-    )
-    feedback, terms = fusion.get("feedback", "none"), fusion.get("terms", 1)
-    mixture = association == "mirrored" or filter_ == "mht"
-    if feedback == "advice" and (association != "tight" or mixture):
-        yield (
-            "fusion.feedback: 'advice' steers the association filter of a single Gaussian, "
-            "which only association = 'tight' with another filter than 'mht' has"
-        )
-    if association == "mirrored" and filter_ not in (None, "mht"):
-        yield f"fusion.filter: {filter_!r} keeps one hypothesis; association = 'mirrored' needs 'mht', or no filter key"
-    if association != "mirrored" and isinstance(terms, int) and terms > 1:
-        yield f"fusion.terms: {terms} terms of a report need association = 'mirrored'"
-    if mode == "dkf" and (mixture or feedback == "reset"):
-        yield "fusion.mode: 'dkf' needs covariances that do not depend on data: no mixture, no feedback = 'reset'"
-    delay, window = fusion.get("feedback_delay", 0.0), fusion.get("window", 10.0)
-    if isinstance(delay, int | float) and isinstance(window, int | float) and delay > window:
-        yield f"fusion.feedback_delay: {delay} s is longer than the {window} s (fusion.window) that nodes keep scans"
+def _dkf_faults(sensors: list[Mapping[str, Any]]) -> Iterator[str]:
+    """What keeps the covariances of all sensors from being known without data."""
+    for i, sensor in enumerate(sensors):
+        if (kind := sensor.get("kind", "position")) != "position":
+            yield f"fusion.mode: 'dkf' needs covariances known without data; those of sensor.{i}, {kind}, are not"
+        if (model := _table(sensor, "detection").get("model", "constant")) != "constant":
+            yield f"fusion.mode: 'dkf' needs a constant detection probability; sensor.{i} has detection {model!r}"
 
 
 def _table(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
@@ -463,13 +306,6 @@ def _table(data: Mapping[str, Any], key: str) -> Mapping[str, Any]:
 def _tables(data: Mapping[str, Any], key: str) -> list[Mapping[str, Any]]:
     value = data.get(key)
     return [entry if isinstance(entry, dict) else {} for entry in value] if isinstance(value, list) else []
-
-
-def _wrong_length(entry: Mapping[str, Any], keys: tuple[str, ...], length: int, where: str) -> Iterator[str]:
-    for key in keys:
-        value = entry.get(key)
-        if isinstance(value, list) and len(value) != length:
-            yield f"{where}.{key}: has {len(value)} numbers, this scenario's dimensions need {length}"
 
 
 def _repeated_names(sensors: list[Mapping[str, Any]]) -> Iterator[str]:

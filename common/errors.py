@@ -8,6 +8,7 @@
     ├── DecodeError          bytes that are no message of ours
     │   └── VersionError     a message of another wire version
     ├── TransportError       the network: endpoint taken, nothing answers
+    ├── StudyError           workers of a study died, or are of another version
     └── LaunchError          a process of a run did not start, or died (launch/processes.py)
 """
 
@@ -36,3 +37,7 @@ class VersionError(DecodeError):
 
 class TransportError(WaldnetError):
     """The network does not do what was asked: an endpoint is taken, nothing answers."""
+
+
+class StudyError(WaldnetError):
+    """A study cannot go on: a worker died, or is of another version."""

@@ -50,6 +50,34 @@ class Report(NamedTuple):
     P: Array
 
 
+class Picked(NamedTuple):
+    """What a sensor node says after one scan where the center tracks: the plots that matter, track by track.
+
+    Attributes:
+        sensor: who reports.
+        sequence: number of the report since the node started.
+        time_ns: time of the scan.
+        next_ns: no later report of this sensor will be about an earlier time; NEVER ends the series.
+        epoch: of the start message the tracks descend from.
+        position: where the sensor stood [m], shape (d,).
+        ids: tracks, ascending, shape (T,).
+        plots: number of plots that matter to each track, shape (T,), sum N.
+        which: their places in z, track after track, shape (N,).
+        z: plots that matter to any track, shape (M, m).
+    """
+
+    sensor: str
+    sequence: int
+    time_ns: int
+    next_ns: int
+    epoch: int
+    position: Array
+    ids: IntArray
+    plots: IntArray
+    which: IntArray
+    z: Array
+
+
 class Scan(NamedTuple):
     """All plots of one sensor at one time; on the wire for display and recording.
 
@@ -230,7 +258,9 @@ class Decision(NamedTuple):
     scans: int
 
 
-Message: TypeAlias = Report | Scan | Proposal | Join | Start | Stop | Advice | Rebase | Clock | Tracks | Decision
+Message: TypeAlias = (
+    Report | Picked | Scan | Proposal | Join | Start | Stop | Advice | Rebase | Clock | Tracks | Decision
+)
 
 
 class Keys(NamedTuple):
@@ -293,7 +323,7 @@ class Keys(NamedTuple):
     def of(self, message: Message) -> str:
         """Where a message is published."""
         match message:
-            case Report():
+            case Report() | Picked():
                 return self.report(message.sensor)
             case Scan():
                 return self.plots(message.sensor)

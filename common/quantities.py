@@ -6,11 +6,19 @@ from datetime import datetime
 from typing import Annotated
 
 import numpy as np
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 NS_PER_S = 1_000_000_000
 #: Times from the epoch, so that nanoseconds since 1970 fit into 64 bits.
 MAX_SECONDS = 4e9
+#: Written with few digits, 2 pi and pi / 2 may come out a little too large.
+_FULL_CIRCLE, _ZENITH = 2.0 * np.pi + 0.005, 0.5 * np.pi + 0.005
+
+
+class Model(BaseModel):
+    """A table of a scenario file: no other keys, and nothing changes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def _probability(value: float) -> float:
@@ -47,6 +55,24 @@ def _finite(value: float) -> float:
     if not np.isfinite(value):
         raise ValueError(f"{value:g} is not finite")
     return value
+
+
+def _angle(value: float) -> float:
+    if not -2.0 * np.pi <= value <= 2.0 * np.pi:
+        raise ValueError(f"{value:g} is no angle in radians (-2 pi to 2 pi)")
+    return value
+
+
+def _span(value: float) -> float:
+    if not 0.0 < value <= _FULL_CIRCLE:
+        raise ValueError(f"{value:g} is no span of azimuths in radians (above 0, up to 2 pi)")
+    return min(value, 2.0 * np.pi)
+
+
+def _elevation(value: float) -> float:
+    if not -_ZENITH <= value <= _ZENITH:
+        raise ValueError(f"{value:g} is no elevation in radians (-pi/2 to pi/2)")
+    return float(np.clip(value, -0.5 * np.pi, 0.5 * np.pi))
 
 
 def _false_plots(value: float) -> float:
@@ -86,6 +112,9 @@ GateProbability = Annotated[float, _NUMBER, AfterValidator(_gate_probability)]
 Positive = Annotated[float, _NUMBER, AfterValidator(_positive)]
 NotNegative = Annotated[float, _NUMBER, AfterValidator(_not_negative)]
 Finite = Annotated[float, _NUMBER, AfterValidator(_finite)]
+Angle = Annotated[float, _NUMBER, AfterValidator(_angle)]
+Span = Annotated[float, _NUMBER, AfterValidator(_span)]
+Elevation = Annotated[float, _NUMBER, AfterValidator(_elevation)]
 FalsePlots = Annotated[float, _NUMBER, AfterValidator(_false_plots)]
 #: For a number that is seconds from the epoch too.
 WITHIN_RANGE = AfterValidator(_seconds)

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.config import FusionConfig, Scenario
+from common.config import Scenario
 from common.estimation.batch import take
-from common.estimation.gaussian import Array, Gaussian, moments
+from common.estimation.gaussian import Array, Gaussian
 from common.estimation.sprt import DELETED
+from common.fusion_config import FusionConfig
 from common.messages import (
     NEVER,
     Advice,
@@ -25,6 +26,7 @@ from common.messages import (
     IntArray,
     Join,
     Message,
+    Picked,
     Rebase,
     Report,
     Start,
@@ -32,14 +34,23 @@ from common.messages import (
     Tracks,
 )
 from common.quantities import NS_PER_S
-from fusion_center.picture import Expected, Fuser, Heard, Picture
-from fusion_center.state import Checkpoint, Counts, Event, Member, Presence, State, Waiting
+from fusion_center.picture import Fuser, Picture
+from fusion_center.selected import SelectedFuser
+from fusion_center.state import (
+    AnyExpected,
+    AnyFuser,
+    AnyHeard,
+    Checkpoint,
+    Counts,
+    Event,
+    Member,
+    Presence,
+    State,
+    Waiting,
+)
 
 #: Wall time between the clock's announcement and its start: nodes on a slow link hear of it in time.
 _LEAD_NS = 50_000_000
-
-#: No position or speed in m, m/s is larger, and no standard deviation smaller than its inverse.
-_LARGEST = 1e15
 
 
 @dataclass(frozen=True)
@@ -60,7 +71,7 @@ class Center:
 
     names: tuple[str, ...]
     fusion: FusionConfig
-    fuser: Fuser
+    fuser: AnyFuser
     hypotheses: Picture
     epoch_ns: int
     speed: float
@@ -71,7 +82,7 @@ class Center:
     @classmethod
     def of(cls, scenario: Scenario, *, speed: float = 0.0, wait_s: float = 10.0, first_epoch: int = 1) -> Center:
         """The center of a scenario."""
-        fuser = Fuser.of(scenario)
+        fuser: AnyFuser = SelectedFuser.of(scenario) if scenario.fusion.mode == "selected" else Fuser.of(scenario)
         picture = fuser.empty()
         if scenario.hypotheses:
             priors = [hypothesis.density for hypothesis in scenario.hypotheses]
@@ -124,9 +135,9 @@ class Center:
             case Presence() if event.sensor in self.names:
                 number = self.names.index(event.sensor)
                 state = state.with_member(number, state.members[number]._replace(alive=event.alive))
-            case Report() if (heard := self._fitting(state, event, now_ns)) is not None:
+            case Report() | Picked() if (heard := self._fitting(state, event, now_ns)) is not None:
                 state, messages = self._accept(state, heard, now_ns)
-            case Report() | Join():
+            case Report() | Picked() | Join():
                 state = state.counted("refused")
             case _:
                 pass
@@ -189,32 +200,12 @@ class Center:
         return 1 + max(self.first_epoch, *(member.epoch for member in state.members), *told)
 
     def _start(self, picture: Picture, number: int, epoch: int) -> Start:
-        """The live tracks for one sensor: its last factor where it reported one, else the prior.
-
-        A report is the whole state of a factor, so the center is every node's backup.
-        """
+        """The live tracks for one sensor."""
         live = picture.status != DELETED
-        held = picture.reported[:, number]
-        prior = self.fuser.share.start(Gaussian(picture.x0, picture.P0))
-        # Which of its hypotheses a node held for true it has not said: the terms' own weights must do.
-        last = moments(np.exp(picture.log_a[:, number]), Gaussian(picture.x[:, number], picture.P[:, number]))
-        x = np.where(held[:, None], last.x, prior.x)
-        P = np.where(held[:, None, None], last.P, prior.P)
-        x_a = np.where(held[:, None], picture.fused_x, picture.x0)
-        P_a = np.where(held[:, None, None], picture.fused_P, picture.P0)
-        return Start(
-            sensor=self.names[number],
-            epoch=epoch,
-            ids=picture.ids[live],
-            times_ns=np.where(held, picture.times_ns, picture.starts_ns)[live],
-            log_p_bar=picture.log_p_bar[live, number],
-            x=x[live],
-            P=P[live],
-            x_a=x_a[live],
-            P_a=P_a[live],
-        )
+        backup = take(self.fuser.backup(picture, number), live)
+        return Start(self.names[number], epoch, picture.ids[live], *backup)
 
-    def _fitting(self, state: State, report: Report, now_ns: int) -> Heard | None:
+    def _fitting(self, state: State, report: Report | Picked, now_ns: int) -> AnyHeard | None:
         """A report, if it comes from a sensor of this network and can be computed with."""
         if report.sensor not in self.names:
             return None
@@ -224,9 +215,7 @@ class Center:
             return None
         if self._ahead(state.clock, report.time_ns, now_ns):
             return None
-        if report.x.shape[-1] != self.fuser.motion.n or (report.terms > self.fuser.terms).any():
-            return None
-        return _sound(report)
+        return self.fuser.heard(report)
 
     def _ahead(self, clock: Clock | None, time_ns: int, now_ns: int) -> bool:
         """Whether a time lies farther in the future than the window: one wrong clock must not make all others late."""
@@ -235,7 +224,7 @@ class Center:
         present_ns = clock.time_ns + round((now_ns - clock.wall_ns) * clock.speed)
         return time_ns > present_ns + self._window_ns + NS_PER_S
 
-    def _accept(self, state: State, heard: Heard, now_ns: int) -> tuple[State, list[Message]]:
+    def _accept(self, state: State, heard: AnyHeard, now_ns: int) -> tuple[State, list[Message]]:
         report = heard.report
         number = self.names.index(report.sensor)
         member = state.members[number]
@@ -249,7 +238,7 @@ class Center:
         waiting = waiting._replace(reports={**waiting.reports, number: heard})
         return state._replace(waiting={**state.waiting, report.time_ns: waiting}), []
 
-    def _late(self, state: State, number: int, heard: Heard) -> tuple[State, list[Message]]:
+    def _late(self, state: State, number: int, heard: AnyHeard) -> tuple[State, list[Message]]:
         """Give a late report its place and compute anew from there on."""
         report = heard.report
         if report.time_ns <= state.base_ns:
@@ -269,7 +258,7 @@ class Center:
         after = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
         return state, [*_corrections(before, after), *pictures]
 
-    def _work_in(self, state: State, time_ns: int, reports: Mapping[int, Heard]) -> State:
+    def _work_in(self, state: State, time_ns: int, reports: Mapping[int, AnyHeard]) -> State:
         lineages = {number: self._lineage(state, number, heard.report) for number, heard in reports.items()}
         rebase = self._followed(state, max(lineages.values()))
         if rebase is None:
@@ -284,7 +273,7 @@ class Center:
         checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), lineage)
         return state._replace(history=(*state.history, checkpoint))
 
-    def _lineage(self, state: State, number: int, report: Report) -> int:
+    def _lineage(self, state: State, number: int, report: Report | Picked) -> int:
         """Epoch of the rebase that a report's factors descend from."""
         followed = any(rebase.epoch == report.epoch for rebase in state.told)
         return report.epoch if followed else state.members[number].lineage
@@ -296,7 +285,7 @@ class Center:
         times = {past.time_ns for past in state.history}
         return next((told for told in state.told if told.epoch == lineage and told.time_ns in times), None)
 
-    def _expected(self, state: State, time_ns: int) -> Expected:
+    def _expected(self, state: State, time_ns: int) -> AnyExpected:
         """The newest picture at a later time: as it was prepared, where that still holds."""
         expected = state.expected
         if expected is not None and expected.picture is state.picture and expected.t_ns == time_ns:
@@ -406,17 +395,6 @@ class Center:
             x=picture.fused_x,
             P=picture.fused_P,
         )
-
-
-def _sound(report: Report) -> Heard | None:
-    """A report, if its factors can be computed with: positive definite, and far from where squares overflow."""
-    variances = report.P.diagonal(axis1=-2, axis2=-1)
-    if (np.abs(report.x) > _LARGEST).any() or (variances > _LARGEST**2).any() or (variances < _LARGEST**-2).any():
-        return None
-    try:
-        return Heard.of(report)
-    except np.linalg.LinAlgError:
-        return None
 
 
 def _corrections(before: list[Decision], after: list[Decision]) -> list[Message]:

@@ -10,15 +10,19 @@ import numpy as np
 
 from common.config import Scenario
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, log_sum_exp, whitener
+from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, log_sum_exp, moments, whitener
+from common.estimation.imm import Imm, Modes, predict_modes
 from common.estimation.mixture_product import multiply_mixtures
 from common.estimation.motion import Motion
 from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import DELETED, TENTATIVE, StatusArray, Thresholds, decide
-from common.messages import Decision, IntArray, Rebase, Report
+from common.messages import Decision, IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
+
+#: No position or speed in m, m/s is larger, and no standard deviation smaller than its inverse.
+_LARGEST = 1e15
 
 
 class Picture(NamedTuple):
@@ -103,6 +107,24 @@ class Heard(NamedTuple):
         return cls(report, log_p_bar, log_a, report.P[which], Whitened(*(part[which] for part in factors)))
 
 
+class Backup(NamedTuple):
+    """What a node goes on from, one row a track of the picture.
+
+    Attributes:
+        times_ns: of the densities, shape (T,).
+        log_p_bar: cumulative so far, shape (T,).
+        x, P: factors, shapes (T, n), (T, n, n).
+        x_a, P_a: association filters, same shapes.
+    """
+
+    times_ns: IntArray
+    log_p_bar: Array
+    x: Array
+    P: Array
+    x_a: Array
+    P_a: Array
+
+
 class Expected(NamedTuple):
     """A picture at its next measurement time: all that does not depend on what will be reported.
 
@@ -112,7 +134,7 @@ class Expected(NamedTuple):
         kept: the tracks that had not been deleted.
         live: which of them started before.
         moving: those.
-        factors: those, predicted.
+        log_a, factors: those, predicted.
         whitened: the same, taken apart.
         product: of the predicted factors.
         network_P: for ``dkf``, the covariances that all factors have by the models alone, predicted.
@@ -123,6 +145,7 @@ class Expected(NamedTuple):
     kept: Picture
     live: BoolArray
     moving: Picture
+    log_a: Array
     factors: Gaussian
     whitened: Whitened
     product: Product
@@ -175,7 +198,7 @@ class Fuser:
             motion=motion,
             sensors=tuple(sensor.build(motion) for sensor in scenario.sensors),
             share=scenario.share,
-            terms=scenario.fusion.terms,
+            terms=len(motion.models) if isinstance(motion, Imm) else scenario.fusion.terms,
             limits=scenario.decision.thresholds if scenario.decision.enabled else None,
             globalised=scenario.fusion.mode == "dkf",
         )
@@ -204,6 +227,37 @@ class Fuser:
             fused_x=np.empty((0, n)),
             fused_P=np.empty((0, n, n)),
             network_P=np.empty((0, n_sensors if self.globalised else 0, n, n)),
+        )
+
+    def heard(self, report: Report | Picked) -> Heard | None:
+        """A report taken apart, if it can be computed with."""
+        if not isinstance(report, Report) or report.x.shape[-1] != self.motion.n or (report.terms > self.terms).any():
+            return None
+        # Positive definite, and far from where squares overflow.
+        variances = report.P.diagonal(axis1=-2, axis2=-1)
+        if (np.abs(report.x) > _LARGEST).any() or (variances > _LARGEST**2).any() or (variances < _LARGEST**-2).any():
+            return None
+        try:
+            return Heard.of(report)
+        except np.linalg.LinAlgError:
+            return None
+
+    def backup(self, picture: Picture, number: int) -> Backup:
+        """What a sensor that joins goes on from: its last factor where it reported one, else the prior.
+
+        A report is the whole state of a factor, so the center is every node's backup.
+        """
+        held = picture.reported[:, number]
+        prior = self.share.start(Gaussian(picture.x0, picture.P0))
+        # Which of its hypotheses a node held for true it has not said: the terms' own weights must do.
+        last = moments(np.exp(picture.log_a[:, number]), Gaussian(picture.x[:, number], picture.P[:, number]))
+        return Backup(
+            times_ns=np.where(held, picture.times_ns, picture.starts_ns),
+            log_p_bar=picture.log_p_bar[:, number],
+            x=np.where(held[:, None], last.x, prior.x),
+            P=np.where(held[:, None, None], last.P, prior.P),
+            x_a=np.where(held[:, None], picture.fused_x, picture.x0),
+            P_a=np.where(held[:, None, None], picture.fused_P, picture.P0),
         )
 
     def begin(self, picture: Picture, ids: IntArray, times_ns: IntArray, priors: Gaussian) -> Picture:
@@ -246,8 +300,8 @@ class Fuser:
         Returns:
             the picture, its rebased tracks at the time of the rebase.
         """
-        rows, given = _common(now.ids, told.ids)
-        old, _ = _common(then.ids, now.ids[rows])
+        rows, given = common(now.ids, told.ids)
+        old, _ = common(then.ids, now.ids[rows])
         assert len(then.ids[old]) == len(now.ids[rows]), "a track that was told of was there"
         log_a, (x, P) = self._shares(Gaussian(told.x[given], told.P[given]))
         part = take(now, rows) if not isinstance(rows, slice) else now
@@ -270,6 +324,8 @@ class Fuser:
         n_sensors, factor = len(self.sensors), self.share.start(densities)
         log_a = np.full((len(factor.x), n_sensors, self.terms), -np.inf)
         log_a[:, :, 0] = 0.0
+        if isinstance(self.motion, Imm):
+            log_a[:] = -np.log(self.terms)
         x, P = (np.repeat(np.repeat(part[:, None, None], n_sensors, axis=1), self.terms, axis=2) for part in factor)
         return log_a, Gaussian(x, P)
 
@@ -278,10 +334,10 @@ class Fuser:
         kept = take(picture, picture.status != DELETED)
         live = kept.times_ns < t_ns
         moving = take(kept, live)
-        factors, network_P = self._predict(moving, t_ns)
+        log_a, factors, network_P = self._predict(moving, t_ns)
         whitened = Whitened(factors.x, *whitener(factors.P))
-        product = multiply_mixtures(moving.log_a, whitened)
-        return Expected(picture, t_ns, kept, live, moving, factors, whitened, product, network_P)
+        product = multiply_mixtures(log_a, whitened)
+        return Expected(picture, t_ns, kept, live, moving, log_a, factors, whitened, product, network_P)
 
     def advance(self, expected: Expected, reports: Mapping[int, Heard]) -> tuple[Picture, list[Decision]]:
         """Work in all reports of one measurement time.
@@ -296,7 +352,7 @@ class Fuser:
             the picture at the measurement time and what was decided.
         """
         moved = self._move(expected, reports)
-        moved, decisions = self._decide(moved)
+        moved, decisions = decided(moved, self.limits)
         return (moved if expected.live.all() else put(expected.kept, expected.live, moved)), decisions
 
     def _move(self, expected: Expected, reports: Mapping[int, Heard]) -> Picture:
@@ -326,18 +382,22 @@ class Fuser:
             network_P=network_P,
         )
 
-    def _predict(self, picture: Picture, t_ns: int) -> tuple[Gaussian, Array]:
-        """Predict all factors as their nodes do (Eq. 5; ``dkf``: with one covariance for all)."""
+    def _predict(self, picture: Picture, t_ns: int) -> tuple[Array, Gaussian, Array]:
+        """Predict all factors and the weights of their terms as their nodes do (Eq. 5)."""
         dt: Array = (t_ns - picture.times_ns) / NS_PER_S
         dt = dt[0, ...] if len(dt) and (dt == dt[0]).all() else dt[:, None, None]
         factors = Gaussian(picture.x, picture.P)
+        if isinstance(self.motion, Imm):
+            dt = dt[..., 0] if dt.ndim else dt
+            modes = predict_modes(Modes(picture.log_a, factors), self.motion, dt, self.share.multiplicity)
+            return modes.log_mu, modes.densities, picture.network_P
         if not self.globalised:
-            return self.share.predict(factors, self.motion, dt), picture.network_P
+            return picture.log_a, self.share.predict(factors, self.motion, dt), picture.network_P
         common = globalise(picture.network_P)
         P = np.repeat(common.P[:, None, None], len(self.sensors), axis=1)
         x = np.matvec(common.G, factors.x[:, :, 0])[:, :, None]
         predicted = self.share.predict(Gaussian(x, P), self.motion, dt)
-        return predicted, predicted.P[:, :, 0]
+        return picture.log_a, predicted, predicted.P[:, :, 0]
 
     def _shrunk(self, network_P: Array, reports: Mapping[int, Heard]) -> Array:
         network_P = network_P.copy()
@@ -349,32 +409,34 @@ class Fuser:
             network_P[:, number] = shrink(P, linear.H, linear.R)
         return network_P
 
-    def _decide(self, picture: Picture) -> tuple[Picture, list[Decision]]:
-        if self.limits is None:
-            return picture, []
-        verdict = decide(picture.log_lr, picture.status, self.limits)
-        # Confirmed anew, a track only has its LR reset: that is monitoring, not a decision.
-        decisions = [
-            Decision(
-                kind="deleted" if verdict.rejected[row] else "confirmed",
-                track=int(picture.ids[row]),
-                time_ns=int(picture.times_ns[row]),
-                log_lr=float(picture.log_lr[row]),
-                log_lr_total=float(picture.log_lr_total[row]),
-                scans=int(picture.scans[row]),
-            )
-            for row in np.nonzero(verdict.status != picture.status)[0]
-        ]
-        return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
+
+def decided(picture: Picture, limits: Thresholds | None) -> tuple[Picture, list[Decision]]:
+    """The picture after the test of every track, and what was decided; without limits nothing is."""
+    if limits is None:
+        return picture, []
+    verdict = decide(picture.log_lr, picture.status, limits)
+    # Confirmed anew, a track only has its LR reset: that is monitoring, not a decision.
+    decisions = [
+        Decision(
+            kind="deleted" if verdict.rejected[row] else "confirmed",
+            track=int(picture.ids[row]),
+            time_ns=int(picture.times_ns[row]),
+            log_lr=float(picture.log_lr[row]),
+            log_lr_total=float(picture.log_lr_total[row]),
+            scans=int(picture.scans[row]),
+        )
+        for row in np.nonzero(verdict.status != picture.status)[0]
+    ]
+    return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
 
 
 def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
     """Lay the reports over the predicted factors; tracks that a report or the picture lacks are left alone."""
     picture = expected.moving
-    who, log_p_bar, log_a = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy(), picture.log_a.copy()
+    who, log_p_bar, log_a = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy(), expected.log_a.copy()
     P, factors = expected.factors.P.copy(), Whitened(*(array.copy() for array in expected.whitened))
     for number, heard in reports.items():
-        rows, others = _common(picture.ids, heard.report.ids)
+        rows, others = common(picture.ids, heard.report.ids)
         who[rows, number] = True
         log_p_bar[rows, number] = heard.log_p_bar[others]
         size = heard.log_a.shape[1]
@@ -385,7 +447,7 @@ def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
     return Reported(who, log_p_bar, log_a, P, factors)
 
 
-def _common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:
+def common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:
     """Where ids that both have stand in each; mostly both have the same."""
     if ours.tobytes() == theirs.tobytes():
         return slice(None), slice(None)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from common.messages import NEVER, Clock, Decision, Join, Rebase, Report
-from fusion_center.picture import Expected, Heard, Picture
+from common.estimation.gaussian import Gaussian
+from common.messages import NEVER, Clock, Decision, IntArray, Join, Picked, Rebase, Report
+from fusion_center.picture import Backup, Expected, Heard, Picture
+from fusion_center.selected import ExpectedTracks, HeardPlots
 
 
 class Presence(NamedTuple):
@@ -20,7 +22,43 @@ class Tick(NamedTuple):
     """Time has passed."""
 
 
-Event: TypeAlias = Report | Join | Presence | Tick
+Event: TypeAlias = Report | Picked | Join | Presence | Tick
+
+
+AnyHeard: TypeAlias = Heard | HeardPlots
+AnyExpected: TypeAlias = Expected | ExpectedTracks
+
+
+class AnyFuser(Protocol):
+    """The steps of a picture: of factors (``Fuser``), or of the center's own tracks (``SelectedFuser``)."""
+
+    def empty(self) -> Picture:
+        """A picture without tracks."""
+        ...
+
+    def begin(self, picture: Picture, ids: IntArray, times_ns: IntArray, priors: Gaussian) -> Picture:
+        """Add tracks."""
+        ...
+
+    def heard(self, report: Report | Picked) -> AnyHeard | None:
+        """A report taken apart, if it can be computed with."""
+        ...
+
+    def backup(self, picture: Picture, number: int) -> Backup:
+        """What a sensor that joins goes on from."""
+        ...
+
+    def rebased(self, now: Picture, then: Picture, told: Rebase) -> Picture:
+        """The newest picture with factors that begin anew."""
+        ...
+
+    def expect(self, picture: Picture, t_ns: int) -> AnyExpected:
+        """Work out what a picture will be at a measurement time, as far as no report is needed for it."""
+        ...
+
+    def advance(self, expected: Any, reports: Mapping[int, Any]) -> tuple[Picture, list[Decision]]:
+        """Work in all reports of one measurement time."""
+        ...
 
 
 class Member(NamedTuple):
@@ -55,7 +93,7 @@ class Checkpoint(NamedTuple):
     """
 
     time_ns: int
-    reports: Mapping[int, Heard]
+    reports: Mapping[int, AnyHeard]
     picture: Picture
     decisions: tuple[Decision, ...]
     lineage: int = 0
@@ -69,7 +107,7 @@ class Waiting(NamedTuple):
         since_ns: wall time of the first one's arrival.
     """
 
-    reports: Mapping[int, Heard]
+    reports: Mapping[int, AnyHeard]
     since_ns: int
 
 
@@ -116,7 +154,7 @@ class State(NamedTuple):
     counts: Counts
     base_lineage: int = 0
     told: tuple[Rebase, ...] = ()
-    expected: Expected | None = None
+    expected: AnyExpected | None = None
 
     @property
     def picture(self) -> Picture:

@@ -23,6 +23,7 @@ from common.process import main as run_app
 from fusion_center.app import center
 from scenarios.catalogue import find, names
 from sensor_node.app import node
+from studies.cli import study
 
 app = App(
     name="waldnet",
@@ -31,6 +32,7 @@ app = App(
 )
 app.command(node)
 app.command(center)
+app.command(study)
 app.command(bench)
 
 

@@ -1,7 +1,7 @@
 """Recorded plots as JSON Lines: one scan a line, empty scans too.
 
 ``{"sensor": "radar-1", "time": 2.0, "plots": [[x, y], ...]}``: time in seconds since the scenario's epoch, plots in the
-sensor's own measurement space; a sensor that moves gives its ``position``.
+sensor's own measurement space (docs/how-to/sensors.md); a sensor that moves gives its ``position``.
 """
 
 from __future__ import annotations
@@ -21,6 +21,12 @@ from common.quantities import MAX_SECONDS
 
 #: No coordinate is larger; NaN and infinities are none.
 _LARGEST = 1e15
+#: Numbers of a plot that cannot be just any: degrees, for example, are soon found out.
+_RANGES = {
+    "range": (0.0, np.inf, "distance"),
+    "azimuth": (-2.0 * np.pi, 2.0 * np.pi, "angle in radians"),
+    "elevation": (-0.5 * np.pi, 0.5 * np.pi, "elevation in radians"),
+}
 _KEYS = {"sensor", "time", "plots", "position"}
 
 
@@ -107,6 +113,8 @@ def _parse(line: str, scenario: Scenario) -> Scan:
         raise ValueError(f"plots: {plots!r} is not a list of plots")
     m = len(sensor.sigma)
     z = [_numbers(plot, m, f"plots.{j}") for j, plot in enumerate(plots)]
+    for j, plot in enumerate(z):
+        _check_range(plot, sensor.numbers, f"plots.{j}")
     return Scan(name, scenario.to_ns(time), position, np.array(z).reshape(-1, m))
 
 
@@ -114,6 +122,13 @@ def _numbers(value: Any, size: int, where: str) -> Array:
     if not isinstance(value, list) or len(value) != size or not all(_is_number(number) for number in value):
         raise ValueError(f"{where}: {value!r} is not a list of {size} finite numbers")
     return np.array(value, dtype=np.float64)
+
+
+def _check_range(plot: Array, numbers: tuple[str, ...], where: str) -> None:
+    for value, name in zip(plot, numbers, strict=True):
+        low, high, meaning = _RANGES.get(name, (-np.inf, np.inf, ""))
+        if not low <= value <= high:
+            raise ValueError(f"{where}: {name} {value:g} is no {meaning}")
 
 
 def _is_number(value: Any) -> bool:

@@ -13,7 +13,9 @@ import numpy as np
 
 from common.config import Scenario, SensorConfig, TargetConfig
 from common.errors import ConfigError
-from common.estimation.gaussian import Array
+from common.estimation.gaussian import Array, draw_noise
+from common.estimation.imm import draw_path
+from common.estimation.sensing import Sensor
 from common.messages import IntArray, Scan
 from common.quantities import NS_PER_S
 
@@ -59,11 +61,8 @@ def _path(scenario: Scenario, target: TargetConfig, times_ns: IntArray, rng: np.
     motion = scenario.motion.build()
     path = np.full((len(times_ns), motion.n), np.nan)
     state, now_ns = _first_state(scenario, target, rng), scenario.to_ns(target.start)
-    for k in np.flatnonzero(times_ns >= now_ns):
-        dt = np.array((times_ns[k] - now_ns) / NS_PER_S)
-        noise = rng.multivariate_normal(np.zeros(motion.n), motion.noise(dt), method="svd")
-        state = motion.transition(dt) @ state + noise
-        path[k], now_ns = state, int(times_ns[k])
+    there = times_ns >= now_ns
+    path[there] = draw_path(motion, state, np.diff(times_ns[there], prepend=now_ns) / NS_PER_S, rng)
     return path
 
 
@@ -92,23 +91,23 @@ def simulate(scenario: Scenario, name: str, seed: int, world: Truth | None = Non
     rng = np.random.default_rng([seed, 2, *name.encode()])
     times_ns = scan_times_ns(scenario, config)
     states = world.x[:, np.searchsorted(world.times_ns, times_ns)]
-    return [_scan(scenario, config, int(t_ns), states[:, k], rng) for k, t_ns in enumerate(times_ns)]
-
-
-def _scan(scenario: Scenario, config: SensorConfig, t_ns: int, states: Array, rng: np.random.Generator) -> Scan:
-    sensor = config.build(scenario.motion.build())
-    stand = config.stand(scenario.motion.dimensions)
+    sensor, stand = config.build(scenario.motion.build()), config.stand(scenario.motion.dimensions)
     center = config.view_center(stand)
+    return [
+        Scan(name, int(t_ns), stand, _plots(sensor, stand, center, states[:, k], rng))
+        for k, t_ns in enumerate(times_ns)
+    ]
+
+
+def _plots(sensor: Sensor, stand: Array, center: Array, states: Array, rng: np.random.Generator) -> Array:
+    """Plots of one scan: of the targets that are detected, and false ones, in random order, shape (M, m)."""
+    measurement = sensor.measurement
     there = states[~np.isnan(states).any(axis=-1)]
-    seen = sensor.field_of_view.contains(there[:, : len(stand)], center) & (rng.random(len(there)) < sensor.p_d)
-    noise = rng.multivariate_normal(np.zeros(sensor.measurement.m), sensor.measurement.R, size=int(seen.sum()))
-    false = sensor.field_of_view.draw(rng, int(rng.poisson(sensor.false_plots)), center)
-    return Scan(
-        config.name,
-        t_ns,
-        stand,
-        rng.permutation(np.concatenate([sensor.measurement.observe(there[seen], stand) + noise, false])),
-    )
+    seen = there[sensor.draw_seen(rng, there, stand, center)]
+    noise = draw_noise(rng, measurement.R, len(seen))
+    places = sensor.field_of_view.draw(rng, int(rng.poisson(sensor.false_plots)), center)
+    true = measurement.fold(measurement.observe(seen, stand) + noise)
+    return rng.permutation(np.concatenate([true, measurement.draw_false(rng, places, stand)]))
 
 
 def simulate_all(scenario: Scenario, seed: int) -> list[Scan]:

@@ -19,10 +19,11 @@ from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, BoolArray, Gaussian
 from common.estimation.mixture import Mixture
 from common.estimation.representation import globalise, shrink
+from common.estimation.selection import Selection, select
 from common.estimation.sensing import Sensor
-from common.messages import Advice, IntArray, Rebase, Report, Scan, Start, Stop
+from common.local_filter import LocalFilter
+from common.messages import Advice, IntArray, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
-from sensor_node.local_filter import LocalFilter
 
 
 class Tracks(NamedTuple):
@@ -139,6 +140,7 @@ class LocalTracker:
         filter: predicts and filters the tracks.
         feedback: the fused track comes back, as advice or to begin anew (theory.md §3, 6).
         rounded: reports are in single precision.
+        selection: which plots are sent, where the center tracks; else None.
         digest: of what the center must have in common with this node.
         buffer_ns: how long scans are kept.
         schedule: scan times of the network, only for ``dkf``.
@@ -151,6 +153,7 @@ class LocalTracker:
     filter: LocalFilter
     feedback: bool
     rounded: bool
+    selection: Selection | None
     digest: str
     buffer_ns: int
     schedule: Schedule | None
@@ -177,6 +180,7 @@ class LocalTracker:
             filter=LocalFilter.of(scenario),
             feedback=scenario.fusion.feedback != "none",
             rounded=scenario.fusion.precision == "float32",
+            selection=scenario.fusion.selection.build() if scenario.fusion.mode == "selected" else None,
             digest=scenario.digest,
             buffer_ns=round(scenario.fusion.window * NS_PER_S),
             schedule=schedule if scenario.fusion.mode == "dkf" else None,
@@ -184,33 +188,60 @@ class LocalTracker:
 
     def initial(self) -> State:
         """A node that was told of no track yet."""
-        n = self.filter.motion.n
-        network = len(self.sensors) if self.schedule else 0
-        none, numbers = np.empty(0, np.int64), np.empty((0, 1))
-        x, P = np.empty((0, 1, n)), np.empty((0, 1, n, n))
-        tracks = Tracks(none, none, numbers, numbers, x, P, none, x, P, np.empty((0, network, n, n)))
-        return State(epoch=0, sequence=0, tracks=tracks, recent=())
+        n, none = self.filter.motion.n, np.empty(0, np.int64)
+        x, P = np.empty((0, n)), np.empty((0, n, n))
+        start = Start("", epoch=0, ids=none, times_ns=none, log_p_bar=np.empty(0), x=x, P=P, x_a=x, P_a=P)
+        return State(epoch=0, sequence=0, tracks=self._fresh(start), recent=())
 
     def prepare(self, state: State, time_ns: int, position: Array) -> State:
         """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
         return state._replace(ready=self._ready(state, time_ns, position))
 
-    def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report]:
+    def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report | Picked]:
         """Filter one scan and report every track that started before it."""
         return self.look(state, Look(scan.time_ns, scan.position, Plots(scan.z)), next_ns)
 
-    def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report]:
+    def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""
         ready = self._ready(state, look.time_ns, look.position)
-        mixture = self.filter.update(ready.mixture, ready.expected, look.plots)
+        mixture = self._filtered(self.filter, ready.mixture, ready.expected, look)
         filtered = self._with(ready.predicted, mixture)
         tracks = filtered if ready.live.all() else _put(ready.advised, ready.live, filtered)
         advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
         kept = tuple(old for old in state.recent if old.time_ns >= look.time_ns - self.buffer_ns)
-        report = self._report(state, look.time_ns, next_ns, filtered.ids, self.filter.report(mixture))
+        if self.selection is None:
+            report: Report | Picked = self._report(state, look.time_ns, next_ns, filtered.ids, mixture)
+        else:
+            report = self._picked(state, look, next_ns, ready, self.selection)
         return State(state.epoch, state.sequence + 1, tracks, (*kept, look), advice), report
 
-    def _report(self, state: State, time_ns: int, next_ns: int, ids: IntArray, mixture: Mixture) -> Report:
+    def _picked(self, state: State, look: Look, next_ns: int, ready: Ready, selection: Selection) -> Picked:
+        plots = look.plots
+        mine = select(ready.mixture.log_w, ready.expected, plots, selection)
+        track, plot = np.nonzero(mine)
+        z, which = plots.z, np.arange(len(track))
+        if z.ndim == 2:
+            used = mine.any(axis=0)
+            z, which = z[used], (np.cumsum(used) - 1)[plot]
+        else:
+            z = z[track, 0, plot]
+        if self.rounded:
+            z = z.astype(np.float32).astype(np.float64)
+        return Picked(
+            sensor=self.config.name,
+            sequence=state.sequence,
+            time_ns=look.time_ns,
+            next_ns=next_ns,
+            epoch=state.epoch,
+            position=look.position,
+            ids=ready.predicted.ids,
+            plots=mine.sum(axis=-1),
+            which=which,
+            z=z,
+        )
+
+    def _report(self, state: State, time_ns: int, next_ns: int, ids: IntArray, filtered: Mixture) -> Report:
+        mixture = self.filter.report(filtered)
         there = mixture.log_w > -np.inf
         x, P = (array[0][there] for array in mixture.density)
         if self.rounded:
@@ -253,7 +284,7 @@ class LocalTracker:
             due = fresh.times_ns < look.time_ns
             if due.any():
                 predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position)
-                filtered = self._with(predicted, self.filter.update(mixture, expected, look.plots))
+                filtered = self._with(predicted, self._filtered(self.filter, mixture, expected, look))
                 fresh = _put(fresh, due, filtered)
         tracks = concatenate(*_alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
@@ -288,34 +319,28 @@ class LocalTracker:
         advice = sorted(past, key=lambda advice: advice.time_ns)[-1]  # of one time the one that came last
         tracks = state.tracks
         _, mine, given = np.intersect1d(tracks.ids, advice.ids, assume_unique=True, return_indices=True)
-        x_a, P_a, times = tracks.x_a.copy(), tracks.P_a.copy(), tracks.times_a_ns.copy()
-        x_a[mine, 0], P_a[mine, 0], times[mine] = advice.x[given], advice.P[given], advice.time_ns
+        log_w, x_a, P_a = tracks.log_w.copy(), tracks.x_a.copy(), tracks.P_a.copy()
+        times, honest = tracks.times_a_ns.copy(), self.filter.honest
+        times[mine] = advice.time_ns
+        # Of several models, the node's own opinion which one is in force stays.
+        _, _, ((x_a[mine],), (P_a[mine],)) = honest.start(Gaussian(advice.x[given], advice.P[given]))
         for look in state.recent:
             due = times < look.time_ns
             if due.any():
-                honest = self.filter.honest.start(Gaussian(x_a[due, 0], P_a[due, 0]))
-                predicted = self.filter.honest.predict(honest, _interval(times[due], look.time_ns))
-                expected = self._seen(self.filter.honest, predicted, look.position)
-                (x, P), times[due] = self.filter.honest.update(predicted, expected, look.plots).density, look.time_ns
-                x_a[due], P_a[due] = x[0], P[0]
-        return tracks._replace(x_a=x_a, P_a=P_a, times_a_ns=times)
+                prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
+                predicted = honest.predict(prior, _interval(times[due], look.time_ns))
+                expected = self._seen(honest, predicted, look.position)
+                log_w[due], _, ((x_a[due],), (P_a[due],)) = self._filtered(honest, predicted, expected, look)
+                times[due] = look.time_ns
+        return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times)
 
     def _fresh(self, start: Start) -> Tracks:
         """Tracks as they are told of."""
         network = len(self.sensors) if self.schedule else 0
-        zero = np.zeros((len(start.ids), 1))
-        return Tracks(
-            start.ids,
-            start.times_ns,
-            zero,
-            zero + start.log_p_bar[:, None],
-            start.x[:, None],
-            start.P[:, None],
-            start.times_ns,
-            start.x_a[:, None],
-            start.P_a[:, None],
-            np.repeat(start.P[:, None], network, axis=1),
-        )
+        both = Gaussian(np.stack([start.x, start.x_a]), np.stack([start.P, start.P_a]))
+        log_w, log_g, (x, P) = self.filter.spread(both, start.log_p_bar)
+        network_P = np.repeat(start.P[:, None], network, axis=1)
+        return Tracks(start.ids, start.times_ns, log_w, log_g, x[0], P[0], start.times_ns, x[1], P[1], network_P)
 
     def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Mixture, Expected]:
         """Predict to a time, and what the sensor will see from a position then."""
@@ -326,6 +351,9 @@ class LocalTracker:
 
     def _seen(self, local: LocalFilter, predicted: Mixture, position: Array) -> Expected:
         return local.expect(predicted.density, self.sensor, position, self.config.view_center(position))
+
+    def _filtered(self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look) -> Mixture:
+        return local.update(predicted, expected, look.plots, self.sensor, look.position)
 
     def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
         mixture = self._mixture(tracks)

@@ -11,9 +11,9 @@ from common.config import Scenario
 from common.estimation.association import Plots
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp, moments
 from common.estimation.mixture import Mixture
+from common.local_filter import HONEST, LocalFilter
 from common.messages import Decision, Scan
 from common.quantities import NS_PER_S
-from sensor_node.local_filter import HONEST, LocalFilter
 from studies.course import Course, Look, Worlds
 from studies.worlds import studied
 
@@ -48,7 +48,7 @@ class _Solo:
         self.predict(look.time_ns)
         center = config.view_center(look.stand)
         expected = self._filter.expect(self.mixture.density, sensor, look.stand, center)
-        self.mixture = self._filter.update(self.mixture, expected, own(look.plots))
+        self.mixture = self._filter.update(self.mixture, expected, own(look.plots), sensor, look.stand)
 
     def predict(self, time_ns: int) -> None:
         """Go on to a time."""

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Ellipse, Patch, Rectangle
+from matplotlib.patches import Circle, Ellipse, Patch, Rectangle, Wedge
 from matplotlib.text import Annotation
 
-from common.config import BoxConfig, DiscConfig, SensorConfig
+from common.config import BoxConfig, DiscConfig, SectorConfig, SensorConfig
 from common.estimation.gaussian import Array
 from common.estimation.sprt import Status
 
@@ -24,6 +25,8 @@ COLOUR = {Status.TENTATIVE: "#8a6d1a", Status.CONFIRMED: "#0b7a3b", Status.DELET
 _SENSOR = "#1f4e9e"
 #: Covariance ellipses of a track, at most.
 _ELLIPSES = 12
+#: Rays of bearings, as a share of the picture.
+_RAY = 0.2
 #: 95 % of a 2-D Gaussian lie within this many standard deviations.
 _RADIUS_95 = 2.4477
 
@@ -84,10 +87,7 @@ def draw_plan(record: Record, path: Path) -> None:
     figure = Figure(figsize=(9, 9), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots()
-    plots = [scan.z[:, :2] for scan in record.scans if len(scan.z)]
-    if plots:
-        points = np.concatenate(plots)
-        axes.plot(points[:, 0], points[:, 1], ".", ms=2.5, color="0.72", label=f"{len(points)} plots", zorder=1)
+    _draw_plots(axes, record)
     for sensor in record.scenario.sensors:
         _draw_sensor(axes, record, sensor)
     for track, history in record.histories().items():
@@ -97,6 +97,43 @@ def draw_plan(record: Record, path: Path) -> None:
     axes.set(xlabel="east [m]", ylabel="north [m]", title=f"{record.scenario.name}: plan view, 95 % ellipses")
     axes.set_aspect("equal", adjustable="datalim")
     figure.savefig(path, dpi=120)
+
+
+def _draw_plots(axes: Axes, record: Record) -> None:
+    """Plots where they lie; of those without a range the first part of the way."""
+    motion = record.scenario.motion.build()
+    places, rays = [], []
+    for sensor in record.scenario.sensors:
+        measurement = sensor.build(motion).measurement
+        for scan in record.scans:
+            if scan.sensor == sensor.name and len(scan.z):
+                stand, at = scan.position[:2], measurement.locate(scan.z, scan.position)[:, :2]
+                if sensor.kind == "bearing":
+                    rays += [(stand, point - stand) for point in at]
+                else:
+                    places.append(at)
+    if places:
+        points = np.concatenate(places)
+        axes.plot(points[:, 0], points[:, 1], ".", ms=2.5, color="0.72", label=f"{len(points)} plots", zorder=1)
+    if rays:
+        length = _RAY * _extent(record)
+        lines = LineCollection(
+            [(stand, stand + length * way) for stand, way in rays],
+            colors="0.72",
+            linewidths=0.5,
+            alpha=0.5,
+            label=f"{len(rays)} bearings (rays cut short)",
+            zorder=1,
+        )
+        axes.add_collection(lines)
+
+
+def _extent(record: Record) -> float:
+    """How far tracks and sensors lie apart [m]."""
+    tracks = [history.x[:, :2] for history in record.histories().values()]
+    stands = [scan.position[None, :2] for scan in record.scans]
+    points = np.concatenate([*tracks, *stands, np.zeros((1, 2))])
+    return float(np.ptp(points, axis=0).max()) or 1000.0
 
 
 def _with_resets(record: Record, track: int, history: History) -> tuple[Array, Array]:
@@ -129,6 +166,11 @@ def _draw_sensor(axes: Axes, record: Record, sensor: SensorConfig) -> None:
         axes.add_patch(Rectangle(tuple(center - size / 2), *size, **style))
     elif isinstance(view, DiscConfig):
         axes.add_patch(Circle(tuple(center), view.radius, **style))
+    elif isinstance(view, SectorConfig):
+        # Matplotlib counts degrees counter-clockwise from east.
+        middle, half = 90.0 - np.degrees(view.direction), 0.5 * np.degrees(view.width)
+        ring = view.radius - view.inner if view.inner else None
+        axes.add_patch(Wedge(tuple(center), view.radius, middle - half, middle + half, width=ring, **style))
 
 
 def _namesakes(record: Record, sensor: SensorConfig, stand: Array) -> int:

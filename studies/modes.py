@@ -122,6 +122,8 @@ MODES: Mapping[str, Play] = {
     "federated-tight-advice": partial(distributed, feedback="advice"),
     "federated-reset": partial(distributed, association="factor", feedback="reset"),
     "federated-tight-reset": partial(distributed, feedback="reset"),
+    "selected-plots": partial(distributed, mode="selected"),
+    "selected-plots-float32": partial(distributed, mode="selected", precision="float32"),
     "decentralised-mean": decentralised_mean,
     "decentralised-decisions": decentralised_decisions,
 }

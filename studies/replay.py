@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from common.config import Scenario
-from common.messages import NEVER, Advice, Decision, Join, Message, Rebase, Report, Scan, Start, Stop, Tracks
+from common.messages import NEVER, Advice, Decision, Join, Message, Picked, Rebase, Report, Scan, Start, Stop, Tracks
 from fusion_center.center import Center
 from sensor_node.sources import schedule_of
 from sensor_node.tracker import LocalTracker
@@ -39,7 +39,7 @@ class Replay:
             self._nodes[name], report = self._trackers[name].scan(self._nodes[name], scan, next(self._next[name]))
             yield from self._tell_center(report)
 
-    def _tell_center(self, message: Report | Join) -> Iterator[Tracks | Decision]:
+    def _tell_center(self, message: Report | Picked | Join) -> Iterator[Tracks | Decision]:
         self._state, answers = self._center.step(self._state, message, 0)
         for answer in answers:
             if isinstance(answer, Tracks | Decision):

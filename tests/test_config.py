@@ -72,6 +72,9 @@ field_of_view = { shape = "everywhere", area = 1e6 }
 duration = 60.0
 seed = 4
 
+[study]
+lost_beyond = 250.0
+
 [recording]
 plots = "plots.jsonl"
 
@@ -125,6 +128,7 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
     assert loaded.sensors[0].first_scan == 0.5
     assert loaded.simulation is not None
     assert (loaded.simulation.duration, loaded.simulation.seed) == (60.0, 4)
+    assert loaded.study.lost_beyond == 250.0
     assert loaded.targets[0].state == (0.0, 0.0, 150.0, 0.0)
     assert (loaded.targets[1].hypothesis, loaded.targets[1].state) == (0, None)
     assert np.array_equal(loaded.hypotheses[0].density.P, np.diag([100.0**2, 90.0**2, 20.0**2, 10.0**2]))
@@ -184,7 +188,15 @@ FAULTS = [
     ("psd = 10.0\n", "", "motion.psd: is missing"),
     ("psd = 10.0", "psd = -1", "motion.psd: -1 is not zero or positive and finite"),
     ("psd = 10.0", "psd = nan", "motion.psd: nan is not zero or positive and finite"),
-    ('model = "cv"', 'model = "ca"', "motion.model: 'ca' is not one of 'cv'"),
+    ('model = "cv"', 'model = "cx"', "motion.model: 'cx' is not one of 'cv', 'ca', 'ct' or 'imm'"),
+    ('model = "cv"', 'model = "ct"', "motion.turn_rate: is missing"),
+    ("psd = 10.0", "psd = 10.0\nturn_rate = 0.1", "motion.turn_rate: is of model = 'ct', not of 'cv'"),
+    ("psd = 10.0", "psd = 10.0\nsojourn = 30.0", "motion.sojourn: is of model = 'imm', not of 'cv'"),
+    (
+        "psd = 10.0",
+        "psd = 10.0\nmodels = [{ psd = 1.0 }, { psd = 2.0 }]",
+        "motion.models: is of model = 'imm', not of 'cv'",
+    ),
     ("dimensions = 2", "dimensions = 4", "motion.dimensions: 4 is not one of 2 or 3"),
     # decision
     ("p0 = 1e-3", "p0 = 0", "decision.p0: 0 is not a probability strictly between 0 and 1"),
@@ -241,7 +253,11 @@ FAULTS = [
     ),
     ("scan_interval = 2.0", "scan_interval = 0", "sensor.0.scan_interval: 0 is not positive and finite"),
     ("first_scan = 0.5", "first_scan = -0.5", "sensor.0.first_scan: -0.5 is not zero or positive and finite"),
-    ('kind = "position"', 'kind = "nose"', "sensor.0.kind: 'nose' is not one of 'position'"),
+    (
+        'kind = "position"',
+        'kind = "nose"',
+        "sensor.0.kind: 'nose' is not one of 'position', 'polar', 'polar-doppler' or 'bearing'",
+    ),
     ('name = "radar-2"', 'name = "radar-1"', "sensor.1.name: 'radar-1' is taken already"),
     (
         'name = "radar-2"',
@@ -253,7 +269,7 @@ FAULTS = [
     (
         'shape = "box"',
         'shape = "star"',
-        "sensor.0.field_of_view: shape 'star' is not one of 'everywhere', 'box', 'disc'",
+        "sensor.0.field_of_view: shape 'star' is not one of 'everywhere', 'box', 'disc', 'sector'",
     ),
     ('shape = "box", ', "", "sensor.0.field_of_view: shape is missing"),
     (", size = [4000.0, 3000.0]", "", "sensor.0.field_of_view.size: is missing"),
@@ -274,13 +290,14 @@ FAULTS = [
     ("area = 1e6", "area = inf", "sensor.2.field_of_view.area: inf is not positive and finite"),
     # world
     ("duration = 60.0\n", "", "simulation.duration: is missing"),
+    ("lost_beyond = 250.0", "lost_beyond = 0", "study.lost_beyond: 0 is not positive and finite"),
     ("seed = 4", "seed = -4", "simulation.seed: got -4: input should be greater than or equal to 0"),
     ("state = [0.0, 0.0, 150.0, 0.0]\n\n[[target]]\nh", "\n[[target]]\nh", "target.0: give either state or hypothesis"),
     ("start = -4.0", "hypothesis = 0", "target.0: give either state or hypothesis"),
     (
         "state = [0.0, 0.0, 150.0, 0.0]\n\n",
         "state = [0.0, 0.0, 150.0]\n\n",
-        "target.0.state: has 3 numbers, this scenario's dimensions need 4",
+        "target.0.state: has 3 numbers, this scenario's dimensions and motion need 4",
     ),
     (
         "hypothesis = 0",
@@ -292,7 +309,7 @@ FAULTS = [
     (
         "sigma = [100.0, 90.0, 20.0, 10.0]",
         "sigma = [100.0, 90.0, 20.0]",
-        "hypothesis.0.sigma: has 3 numbers, this scenario's dimensions need 4",
+        "hypothesis.0.sigma: has 3 numbers, this scenario's dimensions and motion need 4",
     ),
     (
         "sigma = [100.0, 90.0, 20.0, 10.0]",
@@ -329,9 +346,9 @@ def test_three_dimensions_need_longer_lists(tmp_path: Path) -> None:
         "sensor.0.field_of_view.center: has 2 numbers, this scenario's dimensions need 3",
         "sensor.1.sigma: has 2 numbers, this scenario's dimensions need 3",
         "sensor.2.sigma: has 2 numbers, this scenario's dimensions need 3",
-        "hypothesis.0.state: has 4 numbers, this scenario's dimensions need 6",
-        "hypothesis.0.sigma: has 4 numbers, this scenario's dimensions need 6",
-        "target.0.state: has 4 numbers, this scenario's dimensions need 6",
+        "hypothesis.0.state: has 4 numbers, this scenario's dimensions and motion need 6",
+        "hypothesis.0.sigma: has 4 numbers, this scenario's dimensions and motion need 6",
+        "target.0.state: has 4 numbers, this scenario's dimensions and motion need 6",
     ]
 
 

@@ -17,6 +17,8 @@ from common.health import fault
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 HOW_TO = (ROOT / "docs/how-to/first-network.md").read_text()
+STUDY = (ROOT / "docs/how-to/study.md").read_text()
+SENSORS = (ROOT / "docs/how-to/sensors.md").read_text()
 DEPLOY = (ROOT / "docs/how-to/deploy.md").read_text()
 WALDNET = str(Path(sys.executable).with_name("waldnet"))
 
@@ -79,6 +81,16 @@ def test_the_recorded_plots_of_the_how_to_are_valid(folder: Path) -> None:
     assert "2 scans, 2 plots" in run([WALDNET, "check", "harbour.toml", "plots.jsonl"], folder)
 
 
+def test_how_to_of_sensors(tmp_path: Path) -> None:
+    (tmp_path / "hill.toml").write_text(blocks(SENSORS, "toml")[0])
+    (tmp_path / "shown.jsonl").write_text(blocks(SENSORS, "json")[0])
+    check, simulate, replay = commands(SENSORS)
+    assert "4 sensors" in run(check, tmp_path)
+    assert "2 scans, 3 plots" in run([*check, "shown.jsonl"], tmp_path)
+    run(simulate, tmp_path)
+    assert "track 0: confirmed" in run(replay, tmp_path)
+
+
 @pytest.mark.processes
 @pytest.mark.parametrize("way", ["direct", "router"])
 def test_how_to_on_several_machines(folder: Path, way: str) -> None:
@@ -130,6 +142,20 @@ def test_how_to_deploy_without_docker(tmp_path: Path) -> None:
 def test_the_health_shown_is_that_of_a_node() -> None:
     shown = json.loads(blocks(section(DEPLOY, "Health"), "json")[0])
     assert fault(shown, 30.0) is None
+
+
+@pytest.mark.processes
+def test_how_to_study(tmp_path: Path) -> None:
+    steps = [words for title in ("1.", "4.") for words in commands(section(STUDY, title))]
+    assert len(steps) == 3
+    said = [run(words, tmp_path) for words in steps]
+    assert "study/report.html" in said[0]
+    assert "track 0: confirmed" in said[2]
+    columns = (tmp_path / "study/summary.csv").read_text().splitlines()[0].split(",")
+    shown = re.findall(r"`(\w+)`", section(STUDY, "3.").partition("What the columns mean")[2])
+    assert len(shown) > 10
+    unknown = {name for name in shown if name.rstrip("_") == name and not name.startswith("_")} - set(columns)
+    assert unknown == {"lost_beyond"}
 
 
 def test_schema_is_the_one_the_program_prints() -> None:

@@ -9,7 +9,7 @@ from scipy import stats
 
 from common.config import Scenario
 from common.errors import ConfigError
-from scenarios.world import scan_times_ns, simulate, simulate_all, truth
+from scenarios.world import _normal, scan_times_ns, simulate, simulate_all, truth
 
 #: Probability that a statistical test fails though the code is right; seeds are fixed, so it fails always or never.
 ALPHA = 1e-3
@@ -141,6 +141,16 @@ def test_a_target_is_drawn_from_its_hypothesis() -> None:
     )
     first = np.array([truth(plot, seed).x[0, 0] for seed in range(400)])
     assert covariance_fits(first - np.array([1000.0, 0.0, 150.0, 0.0]), np.diag([1e4, 2500.0, 400.0, 100.0]))
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 7])
+@pytest.mark.parametrize("n", [1, 2, 4, 6])
+def test_noise_is_digit_by_digit_that_of_numpy(n: int, count: int) -> None:
+    """Recorded results depend on it; a diagonal matrix, and one with correlations."""
+    A = np.random.default_rng(1).normal(size=(n, n))
+    for P in (np.diag(np.arange(1.0, n + 1.0)), A @ A.T):
+        expected = np.random.default_rng(2).multivariate_normal(np.zeros(n), P, size=count)
+        assert np.array_equal(_normal(np.random.default_rng(2), P, count), expected)
 
 
 def test_two_targets_of_one_hypothesis_are_drawn_apart() -> None:

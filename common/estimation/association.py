@@ -176,6 +176,11 @@ def update(expected: Expected, plots: Plots, choose: Choice = normalise) -> Filt
     Returns:
         posteriors of all filters, shapes (F, ..., n), (F, ..., n, n), and log p_bar of the first, shape (...).
     """
+    return Filtered(*weigh_and_absorb(expected, plots, choose)[:2])
+
+
+def weigh_and_absorb(expected: Expected, plots: Plots, choose: Choice) -> tuple[Gaussian, Array, Array]:
+    """``update``, and as third the logarithm of the weight sum of the filter that associates, shape (...)."""
     plots = within_reach(expected, plots)
     nu = innovations(plots.z, expected.z[..., None, :], expected.angular)
     if plots.valid is not None:
@@ -190,7 +195,7 @@ def update(expected: Expected, plots: Plots, choose: Choice = normalise) -> Filt
     q, log_q_bar = choose(log_weights(expected, log_pdf[-1], inside, plots.log_relative))
     # Eq. (13): with log q_j = log (weight j) - log q_bar, only the densities of the plots do not cancel.
     log_p_bar = log_q_bar + np.vecdot(q[..., 1:], log_pdf[0] - log_pdf[-1])
-    return Filtered(absorb(expected, w, q), log_p_bar)
+    return absorb(expected, w, q), log_p_bar, log_q_bar
 
 
 def innovations(z: Array, expected: Array, angular: tuple[int, ...]) -> Array:

@@ -2,7 +2,7 @@
 
 The probability that a Gaussian position lies inside is found in three steps, each for what the one before left over:
 
-1. Inside or outside by ``_CERTAIN`` sigmas: exactly 1 or 0. A track amid the field of view costs no more than this.
+1. Inside or outside by ``CERTAIN`` sigmas: exactly 1 or 0. A track amid the field of view costs no more than this.
 2. Closed form: a straight edge (ndtr) and a corner with correlation (Owen's T).
 3. Adaptive quadrature: the round edge of a disc, and corners of a box in 3-D whose three axes are correlated.
 
@@ -15,33 +15,19 @@ Largest absolute errors measured, axis ratios of the covariance up to 100:
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.special import gamma, ndtr, owens_t
+from scipy.special import gamma, owens_t
 
 from common.estimation.gaussian import Array, BoolArray, Gaussian
+from common.estimation.quadrature import CERTAIN, Indices, decide, integrate, interval, normal
 
-# Phi(-8.5) = 1e-17 vanishes beside 1.
-_CERTAIN = 8.5
-# Largest difference between a panel of the quadrature and its two halves; the halves are better by orders of magnitude.
-_TOLERANCE = 1e-9
-_BISECTIONS = 30
-# Panels evaluated at once: bounds the memory whatever the batch.
-_CHUNK = 1024
-# Enough for a smooth edge within +-8.5 sigmas, so that most integrals need no bisection.
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(32)
 # In radii. An edge is known to 16 digits, and a sigma must keep more of them than the tolerance asks for, or bisection
 # chases noise. The floor also mends the variance of a needle's narrow axis where rounding made it negative.
 _SIGMA_MIN = 1e-7
 # |rho| = 1 is no density; the next number below is one.
 _RHO_MAX = float(np.nextafter(1.0, 0.0))
-
-Indices: TypeAlias = NDArray[np.intp]
-# Values of integrals ``owner``, shape (K,), at points u, shape (K, nodes).
-Integrand: TypeAlias = Callable[[Indices, Array], Array]
 
 
 class FieldOfView(Protocol):
@@ -122,6 +108,34 @@ class Everywhere(NamedTuple):
         return points
 
 
+class AllAround(NamedTuple):
+    """A sensor that sees every track and tells no range: its false plots come from all directions alike.
+
+    Attributes:
+        dimensions: 2 or 3.
+    """
+
+    dimensions: int
+
+    @property
+    def volume(self) -> float:
+        """Without bound."""
+        return np.inf
+
+    def contains(self, z: Array, center: Array) -> BoolArray:
+        """Whether points lie inside: always, shapes (..., d) to (...)."""
+        return np.ones(np.broadcast_shapes(z.shape, center.shape)[:-1], dtype=np.bool_)
+
+    def probability_inside(self, position: Gaussian, center: Array) -> Array:
+        """Probability that Gaussian positions lie inside: 1.0, shapes (..., d), (..., d, d) to (...)."""
+        mean, _ = _relative(position, center)
+        return np.ones(mean.shape[:-1])
+
+    def draw(self, rng: np.random.Generator, count: int, center: Array) -> Array:
+        """Draw points in all directions from ``center``, within 1 m, shape (count, d)."""
+        return Disc(1.0, self.dimensions).draw(rng, count, center)
+
+
 class Box(NamedTuple):
     """A rectangle or cuboid with its sides along the axes.
 
@@ -152,7 +166,7 @@ class Box(NamedTuple):
             correlation = P[near] / (s[:, :, None] * s[:, None, :])
             return _cuboid((-half - x) / s, (half - x) / s, correlation)
 
-        return _decide(margin, exact)
+        return decide(margin, exact)
 
     def draw(self, rng: np.random.Generator, count: int, center: Array) -> Array:
         """Draw points uniformly inside, shape (count, d)."""
@@ -203,28 +217,6 @@ def _relative(position: Gaussian, center: Array) -> Gaussian:
     return Gaussian(np.broadcast_to(mean, (*batch, d)), np.broadcast_to(position.P, (*batch, d, d)))
 
 
-def _decide(margin: Array, exact: Callable[[BoolArray], Array]) -> Array:
-    """Probabilities by margin alone where that is certain, by ``exact`` where it is not.
-
-    Args:
-        margin: distance of the mean from the edge in sigmas, negative outside, shape (...).
-        exact: gives the probabilities of the entries that a mask of shape (...) selects, shape (N,).
-
-    Returns:
-        probabilities, shape (...).
-    """
-    probability = np.array(margin >= _CERTAIN, dtype=np.float64)
-    near = np.abs(margin) < _CERTAIN
-    if near.any():
-        probability[near] = np.clip(exact(near), 0.0, 1.0)
-    return probability
-
-
-def _interval(lower: Array, upper: Array) -> Array:
-    """Probability that a standard normal number lies between ``lower`` and ``upper``, shape (...)."""
-    return ndtr(upper) - ndtr(lower)
-
-
 def _rectangle(lower: Array, upper: Array, rho: Array) -> Array:
     """Probability that two correlated standard normal numbers lie in a rectangle.
 
@@ -265,10 +257,10 @@ def _cuboid(lower: Array, upper: Array, correlation: Array) -> Array:
         probabilities, shape (N,).
     """
     # An axis that cannot leave the cuboid says nothing, so it may as well be independent of the others.
-    certain = np.minimum(-lower, upper) >= _CERTAIN
+    certain = np.minimum(-lower, upper) >= CERTAIN
     eye = np.eye(lower.shape[-1])
     correlation = np.where(certain[:, :, None] | certain[:, None, :], eye, correlation)
-    probability: Array = _interval(lower, upper).prod(axis=-1)
+    probability: Array = interval(lower, upper).prod(axis=-1)
     coupled = np.triu(correlation, 1).any(axis=(-2, -1))
     if coupled.any():
         lower, upper, correlation = lower[coupled], upper[coupled], correlation[coupled]
@@ -289,7 +281,7 @@ def _cuboid_corner(lower: Array, upper: Array, correlation: Array) -> Array:
     upper = np.take_along_axis(upper, order, axis=-1)
     correlation = correlation[np.arange(len(order))[:, None, None], order[:, :, None], order[:, None, :]]
     to_slice, in_slice = correlation[:, 0, 1:], correlation[:, 1, 2]
-    probability = _interval(lower[:, 0], upper[:, 0]) * _rectangle(lower[:, 1:], upper[:, 1:], in_slice)
+    probability = interval(lower[:, 0], upper[:, 0]) * _rectangle(lower[:, 1:], upper[:, 1:], in_slice)
     coupled = to_slice.any(axis=-1)
     if coupled.any():
         probability[coupled] = _cuboid_by_slices(lower[coupled], upper[coupled], to_slice[coupled], in_slice[coupled])
@@ -315,16 +307,16 @@ def _cuboid_by_slices(lower: Array, upper: Array, c: Array, rho: Array) -> Array
     def integrand(owner: Indices, u: Array) -> Array:
         mean, sigma = c[owner, None] * u[..., None], s[owner, None]
         a, b = (lower[owner, None, 1:] - mean) / sigma, (upper[owner, None, 1:] - mean) / sigma
-        return _normal(u) * _rectangle(a, b, rho[owner, None])
+        return normal(u) * _rectangle(a, b, rho[owner, None])
 
     # Another axis crosses its sides within a few s / |c|. Panels end where a crossing begins and where it ends:
     # those of a thin cigar would slip between the nodes.
     slope = np.where(np.abs(c) < 1e-9, 1e-9, c)[:, None]
-    sides, reach = np.stack([lower[:, 1:], upper[:, 1:]], axis=1) / slope, _CERTAIN * s[:, None] / slope
+    sides, reach = np.stack([lower[:, 1:], upper[:, 1:]], axis=1) / slope, CERTAIN * s[:, None] / slope
     crossings = np.concatenate([sides - reach, sides + reach], axis=1).reshape(-1, 8)
-    limits = np.clip(np.stack([lower[:, 0], upper[:, 0]], axis=-1), -_CERTAIN, _CERTAIN)
+    limits = np.clip(np.stack([lower[:, 0], upper[:, 0]], axis=-1), -CERTAIN, CERTAIN)
     breaks = np.clip(np.concatenate([limits, crossings], axis=-1), limits[:, :1], limits[:, 1:])
-    return _integrate(integrand, np.sort(breaks, axis=-1))
+    return integrate(integrand, np.sort(breaks, axis=-1))
 
 
 def _ball(radius: Array, mean: Array, sigma: Array) -> Array:
@@ -342,10 +334,10 @@ def _ball(radius: Array, mean: Array, sigma: Array) -> Array:
         probabilities, shape (...).
     """
     if mean.shape[-1] == 1:
-        return _interval((-radius - mean[..., 0]) / sigma[..., 0], (radius - mean[..., 0]) / sigma[..., 0])
+        return interval((-radius - mean[..., 0]) / sigma[..., 0], (radius - mean[..., 0]) / sigma[..., 0])
     margin = (radius - np.linalg.vector_norm(mean, axis=-1)) / sigma[..., -1]
     mean, sigma = (np.broadcast_to(a, (*radius.shape, a.shape[-1])) for a in (mean, sigma))
-    return _decide(margin, lambda near: _ball_by_slices(radius[near], mean[near], sigma[near]))
+    return decide(margin, lambda near: _ball_by_slices(radius[near], mean[near], sigma[near]))
 
 
 def _ball_by_slices(radius: Array, mean: Array, sigma: Array) -> Array:
@@ -354,53 +346,9 @@ def _ball_by_slices(radius: Array, mean: Array, sigma: Array) -> Array:
     def integrand(owner: Indices, theta: Array) -> Array:
         r, m, s = radius[owner, None], mean[owner, None], sigma[owner, None]
         slice_radius = r * np.cos(theta)
-        density = _normal((r * np.sin(theta) - m[..., 0]) / s[..., 0]) / s[..., 0]
+        density = normal((r * np.sin(theta) - m[..., 0]) / s[..., 0]) / s[..., 0]
         return density * slice_radius * _ball(slice_radius, m[..., 1:], s[..., 1:])
 
-    reach = _CERTAIN * sigma[:, 0]
+    reach = CERTAIN * sigma[:, 0]
     ends = np.stack([mean[:, 0] - reach, mean[:, 0] + reach], axis=-1) / radius[:, None]
-    return _integrate(integrand, np.arcsin(np.clip(ends, -1.0, 1.0)))
-
-
-def _normal(u: Array) -> Array:
-    """Standard normal density, shape (...)."""
-    density: Array = np.exp(-0.5 * u * u) / np.sqrt(2.0 * np.pi)
-    return density
-
-
-def _integrate(integrand: Integrand, breaks: Array) -> Array:
-    """Integrate many functions at once, each over its own panels, bisecting these until they are resolved.
-
-    Args:
-        integrand: the functions.
-        breaks: ends of the panels, ascending, shape (N, panels + 1).
-
-    Returns:
-        integrals, shape (N,).
-    """
-    total = np.zeros(len(breaks))
-    owner, panel = np.nonzero(breaks[:, :-1] < breaks[:, 1:])
-    a, b = breaks[owner, panel], breaks[owner, panel + 1]
-    whole = _gauss(integrand, owner, a, b)
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (a + b)
-        left, right = _gauss(integrand, owner, a, middle), _gauss(integrand, owner, middle, b)
-        rough = np.abs(left + right - whole) > _TOLERANCE
-        total += np.bincount(owner[~rough], (left + right)[~rough], total.size)
-        if not rough.any():
-            break
-        owner = np.tile(owner[rough], 2)
-        a, b = np.concatenate([a[rough], middle[rough]]), np.concatenate([middle[rough], b[rough]])
-        whole = np.concatenate([left[rough], right[rough]])
-    return total
-
-
-def _gauss(integrand: Integrand, owner: Indices, lower: Array, upper: Array) -> Array:
-    """Gauss-Legendre rule on panels of the integrals ``owner``, shapes (K,) to (K,)."""
-    value = np.empty_like(lower)
-    for start in range(0, lower.size, _CHUNK):
-        part = slice(start, start + _CHUNK)
-        half = 0.5 * (upper[part] - lower[part])
-        u = (lower[part] + half)[:, None] + half[:, None] * _NODES
-        value[part] = half * (integrand(owner[part], u) @ _WEIGHTS)
-    return value
+    return integrate(integrand, np.arcsin(np.clip(ends, -1.0, 1.0)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -275,6 +275,19 @@ def multiply(factors: Whitened, members: BoolArray | None = None) -> Product:
     w = np.matvec(rows, shift) - u
     log_c = -0.5 * np.vecdot(w, w) - half.sum(axis=-1) - half_information + 0.5 * LOG_2PI * n
     return Product(Gaussian(reference[..., 0, :] + shift, P), log_c)
+
+
+def draw_noise(rng: np.random.Generator, P: Array, count: int) -> Array:
+    """Draw from N(0, P), shape (count, n): digit by digit as ``rng.multivariate_normal`` does, P taken apart once."""
+    return np.asarray(rng.standard_normal((count, len(P))) @ _root(P.tobytes(), len(P)))
+
+
+@lru_cache(maxsize=1024)
+def _root(P: bytes, n: int) -> Array:
+    """``A`` with ``A' A = P``, shape (n, n), of the matrix with these bytes."""
+    U, s, _ = np.linalg.svd(np.frombuffer(P).reshape(n, n))
+    root: Array = (U * np.sqrt(s)).T
+    return root
 
 
 def moments(weights: Array, components: Gaussian) -> Gaussian:

@@ -17,7 +17,7 @@ import numpy as np
 from common.estimation.association import Expected, Plots, innovations, within_reach
 from common.estimation.batch import take
 from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array, Gaussian, log_sum_exp, quadratic, squared_norm, symmetric
+from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, quadratic, squared_norm, symmetric
 
 
 class Mixture(NamedTuple):
@@ -113,22 +113,21 @@ def step(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction)
         theory.md Eq. (15), (17); W. Koch, Tracking and sensor data fusion (2014), §3.3.
     """
     near = within_reach(expected, plots)
-    branches = _branched(prior, expected, near, _hits(prior, expected, near))
-    return _combined(_pruned(branches, reduction.prune, len(prior.log_w)), len(prior.log_w), reduction)
+    hit = _hit(prior, expected, near, _hits(prior, expected, near))
+    return _chosen(prior, _missed(prior, expected), hit, reduction)
 
 
 def step_traced(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction) -> tuple[Mixture, Ancestry]:
     """``step``, and where the components come from."""
     tracks = len(prior.log_w)
-    track, parent = np.nonzero(prior.log_w > -np.inf)
     hits = _hits(prior, expected, plots)
-    branches = _branched(prior, expected, plots, hits)
+    branches = _joined(prior, _missed(prior, expected), _hit(prior, expected, plots, hits))
     rows = _survivors(branches, reduction.prune, tracks)
     branches = take(branches, rows)
     label, leader = _groups(branches, tracks, reduction)
-    mixture = _merged(branches, label, leader, tracks)
-    parents = np.concatenate((parent, hits[1]))[rows]
-    plot = np.concatenate((np.full(len(track), -1), hits[2]))[rows]
+    _, missed = np.nonzero(prior.log_w > -np.inf)
+    parent = np.concatenate((missed, hits[1]))[rows]
+    plot = np.concatenate((np.full(len(missed), -1), hits[2]))[rows]
     order = np.lexsort((label, branches.track))
     order = order[label[order] >= 0]
     slot = branches.track[order] * (label.max(initial=0) + 1) + label[order]
@@ -136,7 +135,54 @@ def step_traced(prior: Mixture, expected: Expected, plots: Plots, reduction: Red
     log_w = branches.log_w[order]
     total = np.logaddexp.reduceat(log_w, first)
     log_share = log_w - np.repeat(total, np.diff(first, append=len(slot)))
-    return mixture, Ancestry(branches.track[order], label[order], parents[order], plot[order], log_share)
+    ancestry = Ancestry(branches.track[order], label[order], parent[order], plot[order], log_share)
+    return _merged(branches, label, leader, tracks), ancestry
+
+
+def step_with(prior: Mixture, log_p_star: Array, density: Gaussian, reduction: Reduction) -> Mixture:
+    """``step`` where every hypothesis about the scan has a density of its own.
+
+    Args:
+        prior: predicted to the time of the scan.
+        log_p_star: log p*_j of every component, j = 0 the missed detection, shape (F, T, C, 1 + M).
+        density: of every component under each hypothesis, shapes (F, T, C, 1 + M, n), (F, T, C, 1 + M, n, n).
+        reduction: what may be left.
+
+    Returns:
+        the mixtures after the scan.
+    """
+    alive = (prior.log_w > -np.inf)[..., None] & np.ones(log_p_star.shape[-1], np.bool_)
+    hit = alive & (log_p_star[-1] > -np.inf)
+    hit[..., 0] = False
+    alive[..., 1:] = False
+
+    def branches(which: BoolArray) -> _Branches:
+        at = track, component, hypothesis = np.nonzero(which)
+        x, P = (np.moveaxis(array[:, track, component, hypothesis], 1, 0) for array in density)
+        log_w, log_g = (
+            log[track, component] + weight[at] for log, weight in zip(prior[:2], log_p_star[[-1, 0]], strict=True)
+        )
+        return _Branches(track, log_w, log_g, x, P)
+
+    return _chosen(prior, branches(alive), branches(hit), reduction)
+
+
+def _chosen(prior: Mixture, missed: _Branches, hit: _Branches, reduction: Reduction) -> Mixture:
+    """The mixture of all branches, reduced."""
+    branches = _joined(prior, missed, hit)
+    return _combined(_pruned(branches, reduction.prune, len(prior.log_w)), len(prior.log_w), reduction)
+
+
+def _joined(prior: Mixture, missed: _Branches, hit: _Branches) -> _Branches:
+    """All branches; there is a missed one for every component that lives."""
+    branches = _Branches(*(np.concatenate(pair) for pair in zip(missed, hit, strict=True)))
+    # Where h1 holds the scan for impossible (p_d = 1 and no plot in the gate), nothing can be learnt from it.
+    best = np.full(len(prior.log_w), -np.inf)
+    np.maximum.at(best, branches.track, branches.log_w)
+    if (lost := best == -np.inf).any():
+        rows = lost[branches.track[: len(missed.track)]]
+        branches.log_w[: len(rows)][rows] = prior.log_w[prior.log_w > -np.inf][rows]
+    return branches
 
 
 def reduced(mixture: Mixture, reduction: Reduction) -> Mixture:
@@ -158,19 +204,6 @@ def _missed(prior: Mixture, expected: Expected) -> _Branches:
     log_miss = np.broadcast_to(expected.log_miss, prior.log_w.shape)[alive]
     x, P = (np.moveaxis(array[:, alive[0], alive[1]], 1, 0) for array in expected.density)
     return _Branches(alive[0], prior.log_w[alive] + log_miss, prior.log_g[alive] + log_miss, x, P)
-
-
-def _branched(prior: Mixture, expected: Expected, plots: Plots, hits: tuple[IntArray, ...]) -> _Branches:
-    """All branches, those of missed detections first."""
-    missed, hit = _missed(prior, expected), _hit(prior, expected, plots, hits)
-    branches = _Branches(*(np.concatenate(pair) for pair in zip(missed, hit, strict=True)))
-    # Where h1 holds the scan for impossible (p_d = 1 and no plot in the gate), nothing can be learnt from it.
-    best = np.full(len(prior.log_w), -np.inf)
-    np.maximum.at(best, branches.track, branches.log_w)
-    if (lost := best == -np.inf).any():
-        rows = lost[branches.track[: len(missed.track)]]
-        branches.log_w[: len(rows)][rows] = prior.log_w[prior.log_w > -np.inf][rows]
-    return branches
 
 
 def _hits(prior: Mixture, expected: Expected, near: Plots) -> tuple[IntArray, ...]:

@@ -6,8 +6,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from common.estimation.detection import Constant, Detection, Notch
 from common.estimation.field_of_view import FieldOfView
-from common.estimation.gaussian import Array, Gaussian
+from common.estimation.gaussian import Array, BoolArray, Gaussian
 
 
 class Linearised(NamedTuple):
@@ -39,12 +40,41 @@ class Measurement(Protocol):
         """Measurement noise, shape (m, m)."""
         ...
 
+    @property
+    def angular(self) -> tuple[int, ...]:
+        """Which numbers of a plot are angles around a circle."""
+        ...
+
     def observe(self, x: Array, origin: Array) -> Array:
         """The plot of states ``x`` without noise, seen from ``origin``, shapes (..., n), (d,) to (..., m)."""
         ...
 
     def linearise(self, density: Gaussian, origin: Array) -> Linearised:
         """Expected plot, Jacobian and noise where states are distributed as ``density``, seen from ``origin``."""
+        ...
+
+    def locate(self, z: Array, origin: Array) -> Array:
+        """The positions that plots tell of, shapes (..., m), (d,) to (..., d); 1 m away where they tell no range."""
+        ...
+
+    def fold(self, z: Array) -> Array:
+        """Plots whose noise led out of the range of their numbers, as the sensor would give them, shape (..., m)."""
+        ...
+
+    def draw_false(self, rng: np.random.Generator, places: Array, stand: Array) -> Array:
+        """False plots at given positions, shapes (M, d), (d,) to (M, m)."""
+        ...
+
+    def space(self, volume: float) -> float:
+        """Size of the plot space that false plots come from, up to ``log_stretch``.
+
+        Args:
+            volume: of the field of view, in which they are uniform [m^2, in 3-D m^3].
+        """
+        ...
+
+    def log_stretch(self, z: Array) -> Array | None:
+        """Logarithm of the volume per unit of plot space at plots, shape (..., m) to (...); None where it is 0."""
         ...
 
 
@@ -74,6 +104,11 @@ class Position(NamedTuple):
         """Measurement noise [m^2], shape (m, m)."""
         return np.diag(np.square(self.sigma))
 
+    @property
+    def angular(self) -> tuple[int, ...]:
+        """Which numbers of a plot are angles around a circle: none."""
+        return ()
+
     def observe(self, x: Array, origin: Array) -> Array:  # noqa: ARG002 (a position is seen from anywhere)
         """The position of states ``x``, shape (..., n) to (..., m)."""
         return x[..., : self.m]
@@ -82,29 +117,68 @@ class Position(NamedTuple):
         """Expected plot, Jacobian and noise: exact, as a position is linear in the state."""
         return Linearised(self.observe(density.x, origin), self.H, self.R)
 
+    def locate(self, z: Array, origin: Array) -> Array:  # noqa: ARG002 (a position is seen from anywhere)
+        """The positions that plots tell of: the plots, shape (..., m)."""
+        return z
+
+    def fold(self, z: Array) -> Array:
+        """Plots as the sensor would give them: as they are, shape (..., m)."""
+        return z
+
+    def draw_false(self, rng: np.random.Generator, places: Array, stand: Array) -> Array:  # noqa: ARG002
+        """False plots at given positions, shapes (M, d), (d,) to (M, m)."""
+        return places
+
+    def space(self, volume: float) -> float:
+        """Size of the plot space that false plots come from: that of the field of view."""
+        return volume
+
+    def log_stretch(self, z: Array) -> Array | None:  # noqa: ARG002
+        """None: plot space is space."""
+        return None
+
 
 class Sensor(NamedTuple):
     """The sensor model that node, center and simulation share.
 
     Attributes:
         measurement: what a plot measures.
-        p_d: detection probability inside the field of view.
+        p_d: detection probability inside the field of view, where ``detection`` does not lower it.
         false_plots: mean number of false plots per scan, uniform in the field of view.
         field_of_view: where it sees.
+        detection: how the detection probability depends on the target's state.
     """
 
     measurement: Measurement
     p_d: float
     false_plots: float
     field_of_view: FieldOfView
+    detection: Detection = Constant()
 
     @property
     def log_rho_f(self) -> float:
-        """Logarithm of the density of false plots [1/volume of z]."""
-        return float(np.log(self.false_plots) - np.log(self.field_of_view.volume))
+        """Logarithm of the density of false plots [1/volume of z], where ``log_relative`` is 0."""
+        return float(np.log(self.false_plots) - np.log(self.measurement.space(self.field_of_view.volume)))
 
-    def detection_probability(self, state: Gaussian, stand: Array, center: Array) -> Array:  # noqa: ARG002
-        """``p_d`` weighted by the probability that the state lies inside the field of view.
+    @property
+    def without_notch(self) -> Sensor:
+        """The sensor as if it had no clutter notch: what ``notch.hypotheses`` starts from."""
+        return self._replace(detection=Constant()) if isinstance(self.detection, Notch) else self
+
+    def log_relative(self, z: Array, stand: Array) -> Array | None:  # noqa: ARG002 (plots count from the stand)
+        """Log of the density of false plots where a plot lies, relative to ``log_rho_f`` (theory.md §2).
+
+        Args:
+            z: plots, shape (..., m).
+            stand: where the sensor stands [m], shape (d,).
+
+        Returns:
+            shape (...); None where the density is the same everywhere.
+        """
+        return self.measurement.log_stretch(z)
+
+    def detection_probability(self, state: Gaussian, stand: Array, center: Array) -> Array:
+        """Mean detection probability, 0 outside the field of view, the two taken for independent.
 
         Args:
             state: predicted states, shapes (..., n), (..., n, n), position first.
@@ -116,4 +190,10 @@ class Sensor(NamedTuple):
         """
         d = center.shape[-1]
         position = Gaussian(state.x[..., :d], state.P[..., :d, :d])
-        return self.p_d * self.field_of_view.probability_inside(position, center)
+        inside = self.field_of_view.probability_inside(position, center)
+        return self.p_d * inside * self.detection.mean_share(state, stand)
+
+    def draw_seen(self, rng: np.random.Generator, x: Array, stand: Array, center: Array) -> BoolArray:
+        """Draw which targets are detected, shape (targets, n) to (targets,)."""
+        inside = self.field_of_view.contains(x[:, : len(stand)], center)
+        return inside & (rng.random(len(x)) < self.p_d * self.detection.share(x, stand))

@@ -1,0 +1,155 @@
+"""The filter of a node: every track predicted, expected, updated, in the factor and in the filter that associates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from common.config import Scenario
+from common.estimation.association import Choice, Clutter, Expected, Plots, expect, weigh_and_absorb, within_reach
+from common.estimation.detection import Notch
+from common.estimation.gaussian import Array, Gaussian, log_sum_exp
+from common.estimation.imm import Imm, Modes, predict_modes
+from common.estimation.mixture import Mixture, Reduction, step, step_with, terms
+from common.estimation.motion import Motion
+from common.estimation.notch import hypotheses, merged
+from common.estimation.representation import Share
+from common.estimation.sensing import Sensor
+
+#: The honest prior and noise of the association filter.
+HONEST = Share(1.0)
+
+
+@dataclass(frozen=True)
+class LocalFilter:
+    """How a track's density is predicted and filtered; a single Gaussian is a mixture of one component.
+
+    Attributes:
+        motion: motion model.
+        share: the factor's share of prior and process noise.
+        tight: a filter of its own associates (theory.md §5).
+        choice: how a single Gaussian is associated; None: hypotheses are kept in a mixture.
+        reduction: how far a mixture may grow.
+        terms: most terms in a report.
+        gate_probability: that the target's plot is inside the gate.
+    """
+
+    motion: Motion
+    share: Share
+    tight: bool
+    choice: Choice | None
+    reduction: Reduction
+    terms: int
+    gate_probability: float
+
+    @classmethod
+    def of(cls, scenario: Scenario, share: Share | None = None) -> LocalFilter:
+        """The local filter of a scenario; with another share of the prior than its nodes', if given."""
+        fusion = scenario.fusion
+        return cls(
+            motion=scenario.motion.build(),
+            share=share or scenario.share,
+            tight=share is None and fusion.mode != "selected" and fusion.association != "factor",
+            choice=fusion.choice,
+            reduction=fusion.mixture.build(),
+            terms=fusion.terms,
+            gate_probability=fusion.gate_probability,
+        )
+
+    @property
+    def honest(self) -> LocalFilter:
+        """The filter that associates, alone."""
+        return replace(self, share=HONEST, tight=False)
+
+    @property
+    def shares(self) -> tuple[Share, ...]:
+        """Of the filters of a track, the one that associates last."""
+        return (self.share, HONEST) if self.tight else (self.share,)
+
+    def start(self, prior: Gaussian) -> Mixture:
+        """Tracks that start with ``prior``, shapes (T, n), (T, n, n)."""
+        filters = [share.start(prior) for share in self.shares]
+        return self.spread(Gaussian(*(np.stack(arrays) for arrays in zip(*filters, strict=True))))
+
+    def spread(self, density: Gaussian, log_g: Array | None = None) -> Mixture:
+        """A mixture of one density, or, of several models, of the same for each.
+
+        Args:
+            density: of all filters, shapes (F, T, n), (F, T, n, n).
+            log_g: evidence so far, shape (T,); None: 0.
+        """
+        components = len(self.motion.models) if isinstance(self.motion, Imm) else 1
+        log_w = np.full((density.x.shape[1], components), -np.log(components))
+        several = Gaussian(*(np.repeat(part[:, :, None], components, axis=2) for part in density))
+        return Mixture(log_w, log_w if log_g is None else log_w + log_g[:, None], several)
+
+    def predict(self, prior: Mixture, *intervals: Array) -> Mixture:
+        """Predict all filters of all tracks (Eq. 5), each over its interval [s], shape () or (T,)."""
+        if isinstance(self.motion, Imm):
+            return self._predict_modes(self.motion, prior, intervals)
+        filters = [
+            share.predict(
+                Gaussian(prior.density.x[i], prior.density.P[i]), self.motion, dt[..., None] if dt.ndim else dt
+            )
+            for i, (share, dt) in enumerate(zip(self.shares, intervals, strict=False))
+        ]
+        return prior._replace(density=Gaussian(*(np.stack(arrays) for arrays in zip(*filters, strict=True))))
+
+    def _predict_modes(self, imm: Imm, prior: Mixture, intervals: tuple[Array, ...]) -> Mixture:
+        """Several models; each filter has its own weights, or the center could not predict the factor as its node."""
+        logs = (prior.log_g, prior.log_w) if self.tight else (prior.log_g,)
+        modes = [
+            predict_modes(Modes(log_mu, Gaussian(x, P)), imm, dt, share.multiplicity)
+            for log_mu, x, P, dt, share in zip(logs, *prior.density, intervals, self.shares, strict=False)
+        ]
+        density = Gaussian(*(np.stack(arrays) for arrays in zip(*(mode.densities for mode in modes), strict=True)))
+        log_w = modes[-1].log_mu
+        return Mixture(log_w - log_sum_exp(log_w)[:, None], modes[0].log_mu, density)
+
+    def expect(self, density: Gaussian, sensor: Sensor, stand: Array, center: Array) -> Expected:
+        """What a sensor will see of predicted tracks.
+
+        Args:
+            density: of all filters, shapes (F, T, C, n), (F, T, C, n, n).
+            sensor: the sensor model.
+            stand: where it stands [m], shape (d,).
+            center: of its field of view [m], shape (d,).
+        """
+        p_d = sensor.without_notch.detection_probability(Gaussian(density.x[-1], density.P[-1]), stand, center)
+        clutter = Clutter(p_d, np.array(sensor.log_rho_f), self.gate_probability)
+        return expect(density, sensor.measurement.linearise(density, stand), clutter)
+
+    def update(self, predicted: Mixture, expected: Expected, plots: Plots, sensor: Sensor, stand: Array) -> Mixture:
+        """Filter a scan.
+
+        Args:
+            predicted: the tracks.
+            expected: the same, as the sensor will see them.
+            plots: that all tracks share, z of shape (M, m), or of every track its own, z of shape (T, 1, M, m).
+            sensor: the sensor model.
+            stand: where it stands [m], shape (d,).
+
+        Returns:
+            the tracks after the scan.
+        """
+        plots = plots._replace(log_relative=sensor.log_relative(plots.z, stand))
+        if isinstance(sensor.detection, Notch):
+            given = hypotheses(expected, within_reach(expected, plots), sensor.detection, stand)
+            if self.choice is None:
+                return step_with(predicted, *given, self.reduction)
+            density, log_p_bar, log_q_bar = merged(given, self.choice)
+        elif self.choice is None:
+            return step(predicted, expected, plots, self.reduction)
+        else:
+            density, log_p_bar, log_q_bar = weigh_and_absorb(expected, plots, self.choice)
+        if not isinstance(self.motion, Imm):
+            return Mixture(predicted.log_w, predicted.log_g + log_p_bar, density)
+        log_w = predicted.log_w + np.where(np.isfinite(log_q_bar), log_q_bar, 0.0)
+        return Mixture(log_w - log_sum_exp(log_w)[:, None], predicted.log_g + log_p_bar, density)
+
+    def report(self, mixture: Mixture) -> Mixture:
+        """The terms of a report."""
+        if self.choice is not None:
+            return mixture
+        return terms(mixture, self.terms)

@@ -1,0 +1,305 @@
+"""Sensors in scenario files: what they measure, where they see, what they detect.
+
+Azimuth counts clockwise from north, elevation upward from the horizontal; all angles are in radians.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, Literal, TypeAlias
+
+import numpy as np
+from pydantic import Field
+
+from common.estimation.detection import Constant, Detection, Notch, Swerling
+from common.estimation.field_of_view import AllAround, Box, Disc, Everywhere, FieldOfView
+from common.estimation.gaussian import Array
+from common.estimation.motion import Motion
+from common.estimation.polar import Bearing, Polar, PolarDoppler
+from common.estimation.sector import Sector
+from common.estimation.sensing import Measurement, Position, Sensor
+from common.estimation.sigma_points import SigmaPoint
+from common.quantities import (
+    WITHIN_RANGE,
+    Angle,
+    Elevation,
+    FalsePlots,
+    Finite,
+    InnerProbability,
+    Model,
+    Name,
+    NotNegative,
+    Positive,
+    Probability,
+    Span,
+)
+
+#: Range rates of false plots reach so far unless the file says otherwise [m/s].
+_MAX_SPEED = 300.0
+_NUMBERS = {
+    "position": ("east", "north", "up"),
+    "polar": ("range", "azimuth", "elevation"),
+    "bearing": ("azimuth", "elevation"),
+}
+
+
+class EverywhereConfig(Model):
+    """Sees everywhere; the area gives the density of false plots [m^2, in 3-D m^3].
+
+    Simulated false plots fill a square of that area around the origin. A bearing sensor has no area: its false plots
+    come from all directions alike.
+    """
+
+    shape: Literal["everywhere"]
+    area: Positive | None = None
+
+    def build(self, dimensions: int) -> FieldOfView:
+        """The field of view."""
+        return AllAround(dimensions) if self.area is None else Everywhere(self.area, dimensions)
+
+
+class BoxConfig(Model):
+    """A box with full side lengths ``size`` [m]; without a center it moves with the sensor."""
+
+    shape: Literal["box"]
+    size: tuple[Positive, ...]
+    center: tuple[Finite, ...] | None = None
+
+    def build(self, dimensions: int) -> FieldOfView:  # noqa: ARG002 (the size tells)
+        """The field of view."""
+        return Box(self.size)
+
+
+class DiscConfig(Model):
+    """A disc, in 3-D a ball, of ``radius`` [m]; without a center it moves with the sensor."""
+
+    shape: Literal["disc"]
+    radius: Positive
+    center: tuple[Finite, ...] | None = None
+
+    def build(self, dimensions: int) -> FieldOfView:
+        """The field of view."""
+        return Disc(self.radius, dimensions)
+
+
+class SectorConfig(Model):
+    """A sector around the sensor, with which it moves.
+
+    Attributes:
+        radius: largest range [m].
+        inner: smallest range [m].
+        direction: azimuth of its middle [rad], clockwise from north.
+        width: span of azimuths [rad], up to 2 pi.
+        elevation: lowest and highest elevation [rad], in 3-D only; default: all.
+    """
+
+    shape: Literal["sector"]
+    radius: Positive
+    inner: NotNegative = 0.0
+    direction: Angle
+    width: Span
+    elevation: tuple[Elevation, Elevation] | None = None
+
+    def build(self, dimensions: int) -> Sector:
+        """The field of view."""
+        elevation = self.elevation or (-0.5 * np.pi, 0.5 * np.pi)
+        return Sector(self.radius, self.inner, self.direction, self.width, elevation if dimensions == 3 else None)
+
+
+FieldOfViewConfig: TypeAlias = Annotated[
+    EverywhereConfig | BoxConfig | DiscConfig | SectorConfig, Field(discriminator="shape")
+]
+
+
+class ConstantConfig(Model):
+    """Everything inside the field of view is detected with ``p_d``."""
+
+    model: Literal["constant"] = "constant"
+
+    def build(self) -> Detection:
+        """The detection model."""
+        return Constant()
+
+
+class SwerlingConfig(Model):
+    """A fluctuating target (Swerling I): p_d = p_fa^(1 / (1 + snr)), snr falling with the fourth power of the range.
+
+    Attributes:
+        p_fa: probability of a false alarm in a resolution cell.
+        snr_db: mean signal-to-noise ratio at the range ``at_range`` [dB].
+        at_range: [m].
+    """
+
+    model: Literal["swerling"]
+    p_fa: InnerProbability
+    snr_db: Finite
+    at_range: Positive
+
+    def build(self) -> Detection:
+        """The detection model."""
+        return Swerling(self.p_fa, 10.0 ** (self.snr_db / 10.0), self.at_range)
+
+
+class NotchConfig(Model):
+    """The clutter notch of a GMTI radar: p_d falls to 0 for targets that cross its line of sight.
+
+    Attributes:
+        mdv: minimum detectable velocity [m/s], the radial speed at which half of p_d is left.
+    """
+
+    model: Literal["notch"]
+    mdv: Positive
+
+    def build(self) -> Detection:
+        """The detection model."""
+        return Notch(self.mdv)
+
+
+DetectionConfig: TypeAlias = Annotated[ConstantConfig | SwerlingConfig | NotchConfig, Field(discriminator="model")]
+
+
+class SensorConfig(Model):
+    """One sensor: where it stands, what it measures, how surely, and when.
+
+    Attributes:
+        kind: what a plot is. position: east, north(, up); polar: range, azimuth(, elevation); polar-doppler: the same
+            and range rate; bearing: azimuth(, elevation).
+        sigma: standard deviations of a plot, one per number of it [m, rad, m/s].
+        position: east, north (, up) [m]; a recorded scan may override it. Default: the origin.
+        p_d: detection probability inside the field of view; with the detection model "swerling" there is none.
+        detection: how the detection probability depends on the target.
+        false_plots: mean false plots per scan, uniform in the field of view.
+        max_speed: of polar-doppler: false plots have range rates uniform between its negative and itself [m/s].
+        update: how plots that are not linear in the state are worked in.
+        scan_interval: seconds between scans.
+        first_scan: time of the first one [s]; default: one interval after the start.
+    """
+
+    name: Name
+    kind: Literal["position", "polar", "polar-doppler", "bearing"] = "position"
+    position: tuple[Finite, ...] | None = None
+    sigma: tuple[Positive, ...]
+    p_d: Probability | None = None
+    detection: DetectionConfig = ConstantConfig()
+    false_plots: FalsePlots
+    max_speed: Positive | None = None
+    update: Literal["ekf", "sigma-point"] = "ekf"
+    field_of_view: FieldOfViewConfig
+    scan_interval: Positive = 1.0
+    first_scan: Annotated[NotNegative, WITHIN_RANGE] | None = None
+
+    def build(self, motion: Motion) -> Sensor:
+        """The sensor model for states of a motion model."""
+        return Sensor(
+            self._measurement(motion),
+            1.0 if self.p_d is None else self.p_d,
+            self.false_plots,
+            self.field_of_view.build(motion.dimensions),
+            self.detection.build(),
+        )
+
+    def _measurement(self, motion: Motion) -> Measurement:
+        d, n = motion.dimensions, motion.n
+        if self.kind == "position":
+            return Position(self.sigma, n)
+        measurement: Measurement
+        if self.kind == "polar":
+            measurement = Polar(self.sigma, n)
+        elif self.kind == "polar-doppler":
+            measurement = PolarDoppler(self.sigma, n, self.max_speed or _MAX_SPEED)
+        else:
+            measurement = Bearing(self.sigma, n, self._directions(d))
+        if self.update == "sigma-point":
+            return SigmaPoint(measurement, d, self.kind == "polar-doppler")
+        return measurement
+
+    def _directions(self, dimensions: int) -> float:
+        """Angle, in 3-D solid angle, that false bearings come from."""
+        view = self.field_of_view
+        if isinstance(view, SectorConfig):
+            return view.build(dimensions).directions
+        return 2.0 * np.pi if dimensions == 2 else 4.0 * np.pi
+
+    def stand(self, dimensions: int, moved_to: tuple[float, ...] | None = None) -> Array:
+        """Where the sensor stands during a scan [m], shape (d,)."""
+        return np.array(moved_to or self.position or (0.0,) * dimensions)
+
+    def view_center(self, stand: Array) -> Array:
+        """Center of the field of view of a sensor that stands at ``stand``, shape (d,)."""
+        fov = self.field_of_view
+        if isinstance(fov, EverywhereConfig):
+            return stand if fov.area is None else np.zeros_like(stand)
+        if isinstance(fov, SectorConfig) or fov.center is None:
+            return stand
+        return np.array(fov.center)
+
+    @property
+    def numbers(self) -> tuple[str, ...]:
+        """What the numbers of a plot are."""
+        m = len(self.sigma)
+        if self.kind == "polar-doppler":
+            return (*_NUMBERS["polar"][: m - 1], "range rate")
+        return _NUMBERS[self.kind][:m]
+
+
+def sensor_faults(sensor: Mapping[str, Any], dimensions: int, where: str) -> Iterator[str]:
+    """Faults between the keys of a ``[[sensor]]`` table, tolerant of whatever else is wrong with it."""
+    kind, view = sensor.get("kind", "position"), sensor.get("field_of_view")
+    if kind in ("position", "polar", "polar-doppler", "bearing"):
+        numbers = dimensions + {"polar-doppler": 1, "bearing": -1}.get(kind, 0)
+        why = "" if kind == "position" else f"a {kind} plot in {dimensions} dimensions has {numbers}"
+        yield from wrong_length(sensor, ("sigma",), numbers, where, why)
+    yield from wrong_length(sensor, ("position",), dimensions, where)
+    if isinstance(view, dict):
+        yield from _view_faults(view, kind, dimensions, f"{where}.field_of_view")
+    if kind == "position" and sensor.get("update") == "sigma-point":
+        yield f"{where}.update: 'sigma-point' is for plots that are not linear in the state; a position is"
+    if kind != "polar-doppler" and "max_speed" in sensor:
+        yield f"{where}.max_speed: only a polar-doppler sensor has it, this one is {kind}"
+    detection = sensor.get("detection")
+    swerling = isinstance(detection, dict) and detection.get("model") == "swerling"
+    if swerling and "p_d" in sensor:
+        yield f"{where}.p_d: detection 'swerling' says how probable a detection is; leave it out"
+    elif not swerling and "p_d" not in sensor:
+        yield f"{where}.p_d: is missing"
+
+
+def _view_faults(view: Mapping[str, Any], kind: str, dimensions: int, where: str) -> Iterator[str]:
+    """Faults of a field of view."""
+    shape = view.get("shape")
+    yield from wrong_length(view, ("size", "center"), dimensions, where)
+    if shape == "sector":
+        yield from _sector_faults(view, dimensions, where)
+    if kind != "bearing" and shape == "everywhere" and "area" not in view:
+        yield f"{where}.area: is missing"
+    elif kind == "bearing" and shape == "everywhere" and "area" in view:
+        yield f"{where}.area: a bearing sensor has none: its false plots come from all directions alike"
+    elif kind == "bearing" and (shape == "box" or view.get("center") is not None):
+        yield f"{where}: a bearing sensor sees from where it stands: a sector, a disc without center, or everywhere"
+
+
+def _sector_faults(view: Mapping[str, Any], dimensions: int, where: str) -> Iterator[str]:
+    radius, inner, elevation = view.get("radius", 0.0), view.get("inner", 0.0), view.get("elevation")
+    if _number(radius) and _number(inner) and 0.0 < radius <= inner:
+        yield f"{where}.inner: {inner:g} is not below the radius, {radius:g}"
+    if elevation is not None and dimensions == 2:
+        yield f"{where}.elevation: this scenario has two dimensions"
+    elif isinstance(elevation, list) and len(elevation) == 2 and all(map(_number, elevation)):
+        low, high = elevation
+        if low >= high:
+            yield f"{where}.elevation: {low:g} is not below {high:g}"
+
+
+def wrong_length(
+    entry: Mapping[str, Any], keys: tuple[str, ...], length: int, where: str, why: str = ""
+) -> Iterator[str]:
+    """Lists that do not have the length they need, and why they need it."""
+    for key in keys:
+        value = entry.get(key)
+        if isinstance(value, list) and len(value) != length:
+            reason = why or f"this scenario's dimensions need {length}"
+            yield f"{where}.{key}: has {len(value)} numbers, {reason}"
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)

@@ -22,12 +22,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaln
 
-from common.estimation.association import Clutter, Expected, Plots, expect, innovations, log_weights
+from common.estimation.association import innovations, log_weights
 from common.estimation.batch import take
-from common.estimation.extraction import SensorScan, in_order
+from common.estimation.detection import Notch
+from common.estimation.extraction import SensorScan, expected_of, in_order, weighed
 from common.estimation.gating import IntArray
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp, squared_norm, times_transposed
 from common.estimation.motion import Motion, predict
+from common.estimation.notch import hypotheses
 from common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
 
 
@@ -86,11 +88,11 @@ class _Branches(NamedTuple):
 
     Attributes:
         log_lambda: log p*_j, shape (S, 1 + M); -inf is outside the gate.
-        w: whitened innovations, shape (S, M, m).
+        density: after it, shapes (S, 1 + M, n), (S, 1 + M, n, n).
     """
 
     log_lambda: Array
-    w: Array
+    density: Gaussian
 
 
 def cluster(density: Gaussian, most: int, log_w: Array | None = None) -> Cluster:
@@ -151,17 +153,14 @@ class ClusterTest:
         References:
             theory.md Eq. (14), (16), (20); W. Koch, Tracking and sensor data fusion (2014), §4.
         """
-        density = predicted.density
-        linear = scan.sensor.measurement.linearise(density, scan.stand)
-        p_d = scan.sensor.detection_probability(density, scan.stand, scan.center)
-        one = Gaussian(density.x[None], density.P[None])
-        clutter = Clutter(p_d, np.array(scan.sensor.log_rho_f), self.gate_probability)
-        expected = expect(one, linear._replace(z=linear.z[None]), clutter)
-        branches = _branched(expected, scan.plots)
+        branches = _branched(predicted.density, scan, self.gate_probability)
         grown = [self._kept(_grown(joint, branches.log_lambda)) for joint in predicted.joint]
+        # Sub-tracks that no joint history speaks of any more are forgotten, the others numbered anew.
         used = np.unique(np.concatenate([joint.members.ravel() for joint in grown]))
         joint = tuple(joint._replace(members=np.searchsorted(used, joint.members)) for joint in grown)
-        after = predicted._replace(density=_states(expected, branches, used), joint=joint, scans=predicted.scans + 1)
+        which = np.divmod(used, branches.log_lambda.shape[1])
+        density = Gaussian(*(part[which] for part in branches.density))
+        after = predicted._replace(density=density, joint=joint, scans=predicted.scans + 1)
         log_lr = log_sum_exp(after.log_lr_n) - np.log(len(joint))
         verdict = decide(log_lr[None], predicted.status, self.limits)
         if verdict.accepted[0]:
@@ -206,8 +205,13 @@ def extract_cluster(
             return
 
 
-def _branched(expected: Expected, plots: Plots) -> _Branches:
+def _branched(density: Gaussian, scan: SensorScan, gate_probability: float) -> _Branches:
     """Every sub-track with every plot."""
+    expected = expected_of(Gaussian(density.x[None], density.P[None]), scan, gate_probability)
+    plots = weighed(scan)
+    if isinstance(scan.sensor.detection, Notch):
+        log_p_star, (x, P) = hypotheses(expected, plots, scan.sensor.detection, scan.stand)
+        return _Branches(log_p_star[0], Gaussian(x[0], P[0]))
     nu = innovations(plots.z, expected.z[0, :, None], expected.angular)
     w = times_transposed(nu, expected.whitener[0])
     distance = squared_norm(w)
@@ -215,7 +219,15 @@ def _branched(expected: Expected, plots: Plots) -> _Branches:
     if plots.valid is not None:
         inside &= plots.valid
     log_pdf = expected.log_peak[0, :, None] - 0.5 * distance
-    return _Branches(log_weights(expected, log_pdf, inside, plots.log_relative), w)
+    (x, P), P_hit = density, expected.P_hit[0]
+    hit = x[:, None] + np.matvec(expected.W[0, :, None], w)
+    return _Branches(
+        log_weights(expected, log_pdf, inside, plots.log_relative),
+        Gaussian(
+            np.concatenate((x[:, None], hit), axis=1),
+            np.concatenate((P[:, None], np.repeat(P_hit[:, None], hit.shape[1], axis=1)), axis=1),
+        ),
+    )
 
 
 def _grown(joint: Joint, log_lambda: Array) -> Joint:
@@ -246,14 +258,3 @@ def _grown(joint: Joint, log_lambda: Array) -> Joint:
     summed = np.full(len(members), -np.inf)
     np.logaddexp.at(summed, same.ravel(), weight)
     return Joint(summed, members)
-
-
-def _states(expected: Expected, branches: _Branches, used: IntArray) -> Gaussian:
-    """Densities of the sub-tracks that joint histories still speak of, numbered as ``_grown`` does."""
-    parent, choice = np.divmod(used, branches.log_lambda.shape[1])
-    x, P = expected.density.x[0, parent], expected.density.P[0, parent]
-    hit = np.flatnonzero(choice)
-    gain, w = expected.W[0, parent[hit]], branches.w[parent[hit], choice[hit] - 1]
-    x[hit] += np.matvec(gain, w)
-    P[hit] = expected.P_hit[0, parent[hit]]
-    return Gaussian(x, P)

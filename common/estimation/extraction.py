@@ -15,12 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import Clutter, Plots, expect
+from common.estimation.association import Clutter, Expected, Plots, expect, within_reach
 from common.estimation.batch import concatenate, take
+from common.estimation.detection import Notch
 from common.estimation.gating import IntArray
 from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
-from common.estimation.mixture import Mixture, Reduction, step
+from common.estimation.mixture import Mixture, Reduction, step, step_with
 from common.estimation.motion import Motion, predict
+from common.estimation.notch import hypotheses
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
 
@@ -157,16 +159,17 @@ class Extractor:
             theory.md Eq. (14), (15); W. Koch, Tracking and sensor data fusion (2014), §4.
         """
         alive = predicted.status != DELETED
-        given, plots = take(predicted, alive), _of(scan.plots, alive)
+        given, plots = take(predicted, alive), _of(weighed(scan), alive)
         if not alive.any():
             return given
         density = Gaussian(given.x[None], given.P[None])
-        linear = scan.sensor.measurement.linearise(density, scan.stand)
-        p_d = scan.sensor.detection_probability(Gaussian(given.x, given.P), scan.stand, scan.center)
-        clutter = Clutter(p_d, np.array(scan.sensor.log_rho_f), self.gate_probability)
-        after = step(
-            Mixture(given.log_w, given.log_lambda, density), expect(density, linear, clutter), plots, self.reduction
-        )
+        prior = Mixture(given.log_w, given.log_lambda, density)
+        expected = expected_of(density, scan, self.gate_probability)
+        if isinstance(scan.sensor.detection, Notch):
+            every = hypotheses(expected, within_reach(expected, plots), scan.sensor.detection, scan.stand)
+            after = step_with(prior, *every, self.reduction)
+        else:
+            after = step(prior, expected, plots, self.reduction)
         verdict = decide(log_sum_exp(after.log_g), given.status, self.limits)
         return Candidates(
             ids=given.ids,
@@ -203,6 +206,19 @@ def extract(
         yield given
         if (given.status == DELETED).all():
             return
+
+
+def expected_of(density: Gaussian, scan: SensorScan, gate_probability: float) -> Expected:
+    """What the sensor will see of Gaussians, shapes (1, ..., n), (1, ..., n, n), if it has no clutter notch."""
+    sensor = scan.sensor.without_notch
+    p_d = sensor.detection_probability(Gaussian(density.x[0], density.P[0]), scan.stand, scan.center)
+    clutter = Clutter(p_d, np.array(sensor.log_rho_f), gate_probability)
+    return expect(density, sensor.measurement.linearise(density, scan.stand), clutter)
+
+
+def weighed(scan: SensorScan) -> Plots:
+    """The plots, with the density of false ones where they lie."""
+    return scan.plots._replace(log_relative=scan.sensor.log_relative(scan.plots.z, scan.stand))
 
 
 def in_order(start_time: float, scans: Iterable[SensorScan]) -> Iterator[tuple[float, SensorScan]]:

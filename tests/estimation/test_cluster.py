@@ -14,11 +14,13 @@ from scipy.stats import beta
 
 from common.estimation.association import Plots
 from common.estimation.cluster import Cluster, ClusterTest, cluster, extract_cluster
+from common.estimation.detection import Constant, Detection, Notch
 from common.estimation.extraction import Extractor, SensorScan, candidates, extract
 from common.estimation.field_of_view import Everywhere
 from common.estimation.gaussian import Gaussian
 from common.estimation.mixture import EXACT
 from common.estimation.motion import ConstantVelocity
+from common.estimation.polar import Polar
 from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds, thresholds
 
@@ -126,6 +128,22 @@ def test_one_target_at_most_is_track_extraction() -> None:
     assert last.log_lr[0] == pytest.approx(alone.log_lr[0], rel=1e-9, abs=1e-9)
     np.testing.assert_allclose(np.sort(last.density.x, axis=0), np.sort(alone.x[0], axis=0), rtol=1e-9, atol=1e-9)
     np.testing.assert_array_equal(last.cardinality, [1.0])
+
+
+@pytest.mark.parametrize("detection", [Constant(), Notch(20.0)])
+def test_one_target_at_most_of_a_polar_radar_is_track_extraction(detection: Detection) -> None:
+    """Plots in range and azimuth; with a clutter notch, of which a missed detection tells."""
+    radar = Sensor(Polar((5.0, 0.02), 4), 0.8, 12.0, Everywhere(4e6, 2), detection)
+    east = Gaussian(np.array([900.0, 0.0, 30.0, 1.0]), np.diag([100.0, 150.0, 16.0, 9.0]))
+    z = [np.array([[930.0, 0.01], [925.0, -0.02]]), np.zeros((0, 2)), np.array([[990.0, 0.02 - 2.0 * np.pi]])]
+    # Azimuth is counted from north.
+    at = np.array([0.0, 0.5 * np.pi])
+    scans = [SensorScan(1.0 + k, radar, ORIGIN, ORIGIN, Plots(plots + at)) for k, plots in enumerate(z)]
+    start = candidates(np.array([0]), Gaussian(east.x[None, None], east.P[None, None]))
+    *_, alone = extract(Extractor(MOTION, EVERYTHING.limits, EXACT, 1.0), start, 0.0, scans)
+    last = run(EVERYTHING, cluster(stacked(east), 2), scans)
+    assert last.log_lr_n[0] == pytest.approx(alone.log_lr[0], rel=1e-9, abs=1e-9)
+    assert last.log_lr_n[1] != pytest.approx(2.0 * alone.log_lr[0], rel=1e-3)
 
 
 def test_with_generous_limits_nothing_that_counts_is_lost() -> None:

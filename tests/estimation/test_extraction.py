@@ -11,14 +11,16 @@ from enumeration import History, Problem, all_histories, log_likelihood
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
-from scipy.stats import binom
+from scipy.stats import binom, multivariate_normal
 
 from common.estimation.association import Plots
+from common.estimation.detection import Constant, Detection, Notch
 from common.estimation.extraction import Candidates, Extractor, SensorScan, candidates, extract, seeds, together
 from common.estimation.field_of_view import Everywhere
 from common.estimation.gaussian import Array, Gaussian
 from common.estimation.mixture import EXACT, Reduction
 from common.estimation.motion import ConstantVelocity
+from common.estimation.polar import Polar
 from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds, thresholds
 
@@ -125,6 +127,37 @@ def test_a_seed_is_the_plot_and_any_velocity() -> None:
     x, P = seeds(Gaussian(np.array([[[3.0, 4.0]]]), R[None, None]), 30.0)
     np.testing.assert_array_equal(x, [[[3.0, 4.0, 0.0, 0.0]]])
     np.testing.assert_array_equal(P[0, 0], np.block([[R, np.zeros((2, 2))], [np.zeros((2, 2)), 900.0 * np.eye(2)]]))
+
+
+# ---- other sensors
+
+
+def radar(detection: Detection) -> Sensor:
+    return Sensor(Polar((5.0, 0.02), 4), 0.8, 12.0, Everywhere(4e6, 2), detection)
+
+
+EAST = Gaussian(np.array([900.0, 0.0, 30.0, 1.0]), np.diag([100.0, 150.0, 16.0, 9.0]))
+
+
+def test_false_plots_of_a_polar_sensor_are_as_dense_as_their_range_says() -> None:
+    """Uniform in the plane, so in range and azimuth their density grows with range; azimuth goes round the circle."""
+    z = np.array([[905.0, 0.5 * np.pi + 0.01 - 2.0 * np.pi]])
+    (ours,) = extract(EVERYTHING, one(EAST), 0.0, [scan_of(radar(Constant()), 0.0, z)])
+    S = np.diag([100.0 + 25.0, 150.0 / 900.0**2 + 0.02**2])
+    log_hit = multivariate_normal([900.0, 0.0], S).logpdf([905.0, 0.01])
+    expected = np.log(0.2 + 0.8 * np.exp(log_hit) / (12.0 / 4e6 * 905.0))
+    assert ours.log_lr[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_who_is_not_seen_by_a_radar_with_a_clutter_notch_may_be_slow() -> None:
+    """Against the integral over the radial speed, here the velocity to the east."""
+    notch = Notch(20.0)
+    (ours,) = extract(EVERYTHING, one(EAST), 0.0, [scan_of(radar(notch), 0.0, np.zeros((0, 2)))])
+    speed = np.linspace(30.0 - 40.0, 30.0 + 40.0, 20001)
+    unseen = (1.0 - 0.8 * (1.0 - 2.0 ** -np.square(speed / 20.0))) * np.exp(-0.5 * np.square(speed - 30.0) / 16.0)
+    assert np.exp(ours.log_lr[0]) == pytest.approx(np.trapezoid(unseen, speed) / np.sqrt(2.0 * np.pi * 16.0), rel=1e-4)
+    mean = np.trapezoid(unseen * speed, speed) / np.trapezoid(unseen, speed)
+    assert ours.x[0, 0, 2] == pytest.approx(mean, rel=1e-4)
 
 
 # ---- decisions

@@ -4,7 +4,7 @@ Targets that may have caused each other's plots must be explained together: a jo
 plot of which scan was its own, and no plot is that of two. Given a joint history the targets are independent, so its
 likelihood is the product of those of single-target histories, and these are shared by many joint histories::
 
-    LR_n(k) = sum over joint histories h of prod_{i=1..n} lambda(h_i)                                        (20)
+    LR_n(k) = sum over joint histories h of prod_{i=1..n} lambda(h_i)                                        (16a)
 
 with lambda as in Eq. (15). The targets are drawn from one prior and have no names: of the up to n! joint histories that
 differ only in who is who one is kept, with the weight of all.
@@ -64,7 +64,7 @@ class Cluster(NamedTuple):
 
     @property
     def log_lr_n(self) -> Array:
-        """Logarithms of LR_n (Eq. 20), shape (N,); after a confirmation scaled so that their mean was 1 there."""
+        """Logarithms of LR_n (Eq. 16a), shape (N,); after a confirmation scaled so that their mean was 1 there."""
         return np.array([log_sum_exp(joint.log_lambda) for joint in self.joint])
 
     @property
@@ -141,7 +141,7 @@ class ClusterTest:
         return given._replace(density=predict(given.density, self.motion.transition(dt), self.motion.noise(dt)))
 
     def step(self, predicted: Cluster, scan: SensorScan) -> Cluster:
-        """Work in a scan and decide (Eq. 14, 16, 20).
+        """Work in a scan and decide (Eq. 14, 16, 16a).
 
         Args:
             predicted: to the time of the scan.
@@ -151,7 +151,7 @@ class ClusterTest:
             the cluster after the scan. Where it is confirmed, log LR = 0 and all LR_n are scaled alike.
 
         References:
-            theory.md Eq. (14), (16), (20); W. Koch, Tracking and sensor data fusion (2014), §4.
+            theory.md Eq. (14), (16), (16a); W. Koch, Tracking and sensor data fusion (2014), §4.
         """
         branches = _branched(predicted.density, scan, self.gate_probability)
         grown = [self._kept(_grown(joint, branches.log_lambda)) for joint in predicted.joint]
@@ -231,7 +231,7 @@ def _branched(density: Gaussian, scan: SensorScan, gate_probability: float) -> _
 
 
 def _grown(joint: Joint, log_lambda: Array) -> Joint:
-    """All continuations of joint histories in which no plot is that of two targets (Eq. 20).
+    """All continuations of joint histories in which no plot is that of two targets (Eq. 16a).
 
     Args:
         joint: before the scan.

@@ -2,7 +2,7 @@
 
 A step goes from the smoothed density at the next time back to a filtered one, by Rauch-Tung-Striebel::
 
-    G = P F' (F P F' + Q)^-1        x~ = x + G (x~+ - F x)        P~ = (I - G F) P (I - G F)' + G (P~+ + Q) G'    (19)
+    G = P F' (F P F' + Q)^-1        x~ = x + G (x~+ - F x)        P~ = (I - G F) P (I - G F)' + G (P~+ + Q) G'    (15a)
 
 Textbooks write ``P + G (P~+ - F P F' - Q) G'``, which is the same number and loses its positive sign to rounding.
 
@@ -83,7 +83,7 @@ def generation(mixture: Mixture, ancestry: Ancestry, F: Array, Q: Array) -> Gene
 
 
 def backward(filtered: Gaussian, F: Array, Q: Array, later: Gaussian) -> Gaussian:
-    """One step back (Eq. 19).
+    """One step back (Eq. 15a).
 
     Args:
         filtered: densities given the data up to their time, shapes (..., n), (..., n, n).
@@ -98,7 +98,7 @@ def backward(filtered: Gaussian, F: Array, Q: Array, later: Gaussian) -> Gaussia
         numpy.linalg.LinAlgError: when a predicted covariance is not positive definite.
 
     References:
-        theory.md Eq. (19); Rauch, Tung & Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
+        theory.md Eq. (15a); Rauch, Tung & Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
     x, P = filtered
     FP = F @ P
@@ -111,7 +111,7 @@ def backward(filtered: Gaussian, F: Array, Q: Array, later: Gaussian) -> Gaussia
 
 
 def smooth(filtered: Gaussian, motion: Motion, intervals: Array) -> Gaussian:
-    """Fixed-interval smoothing of single Gaussians (Eq. 19).
+    """Fixed-interval smoothing of single Gaussians (Eq. 15a).
 
     Args:
         filtered: densities after each time's data, times on the first axis, shapes (K, ..., n), (K, ..., n, n).
@@ -125,7 +125,7 @@ def smooth(filtered: Gaussian, motion: Motion, intervals: Array) -> Gaussian:
         ValueError: unless there is one interval fewer than there are times.
 
     References:
-        theory.md Eq. (19); W. Koch, Fixed-interval retrodiction approach to Bayesian IMM-MHT, IEEE TAES 36(1), 2000.
+        theory.md Eq. (15a); W. Koch, Fixed-interval retrodiction approach to Bayesian IMM-MHT, IEEE TAES 36(1), 2000.
     """
     x, P = filtered
     if len(intervals) != len(x) - 1:

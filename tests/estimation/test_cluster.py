@@ -116,7 +116,7 @@ def test_of_joint_histories_that_differ_in_who_is_who_one_is_kept() -> None:
 
 
 def test_one_target_at_most_is_track_extraction() -> None:
-    """Eq. (20) with n = 1 is Eq. (15)."""
+    """Eq. (16a) with n = 1 is Eq. (15)."""
     scans = scans_of(4, [3, 2, 0, 3], [NEAR, FAR, NEAR, NEAR])
     *_, alone = extract(
         Extractor(MOTION, EVERYTHING.limits, EXACT, 1.0),

@@ -119,8 +119,8 @@ def test_pictures_that_a_late_report_changes_take_the_place_of_the_others() -> N
             past, lagged = lag.step(past, picture)
         return past, lagged
 
-    past, straight = last(right)
-    _, late = last([*right[:2], *wrong[2:5], *right[2:]])
+    _, straight = last(right)
+    past, late = last([*right[:2], *wrong[2:5], *right[2:]])
     assert straight.x.tolist() == late.x.tolist()
     assert [picture.time_ns / NS_PER_S for picture in past] == [1.0, 2.5, 3.0, 5.0, 5.5, 8.0]
     past, _ = lag.step(past, tracks(12.0, [3], right[-1].x, right[-1].P))

@@ -143,7 +143,8 @@ def histories(generations: Sequence[Generation]) -> list[Histories]:
 
     Every history that lives in the last generation is smoothed on its own and keeps its weight. Where components were
     combined, a history branches backwards into all of theirs, with their shares; the numbers are exact as long as
-    nothing was combined or dropped, and grow with what was combined.
+    nothing was combined or dropped, and grow with what was combined. For a fixed lag give
+    the last few generations only.
 
     Args:
         generations: mixtures after scan upon scan, the last one newest.
@@ -183,7 +184,8 @@ def descendants(generations: Sequence[Generation]) -> list[Retrodicted]:
 
     Strong sons strengthen weak fathers; where all sons have died, so has the father. A father's density is that of all
     his descendants, by moments: a step back is linear, so mean and covariance of every component are those of its
-    histories, and only their shape is lost. The work is that of the filter, however long the past.
+    histories, and only their shape is lost. The work is that of the filter, however long the past; for a fixed lag give
+    the last few generations only.
 
     Args:
         generations: mixtures after scan upon scan, the last one newest.

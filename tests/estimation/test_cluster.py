@@ -194,15 +194,23 @@ def test_a_cluster_of_nothing_is_deleted() -> None:
 def test_fewer_plots_than_targets_that_are_surely_seen() -> None:
     """p_d = 1: so many targets are impossible; with no plot at all, every number is."""
     sure = NEAR._replace(p_d=1.0)
-    scan = SensorScan(1.5, sure, ORIGIN, ORIGIN, Plots(np.array([[3.0, 2.0]])))
-    (last,) = extract_cluster(EVERYTHING, cluster(stacked(PRIOR), 2), 0.0, [scan])
-    np.testing.assert_array_equal(last.cardinality, [1.0, 0.0])
+    scan = SensorScan(1.5, sure, ORIGIN, ORIGIN, Plots(np.array([[3.0, 2.0], [12.0, -9.0]])))
+    (last,) = extract_cluster(EVERYTHING, cluster(stacked(PRIOR), 3), 0.0, [scan])
+    np.testing.assert_array_equal(last.cardinality > 0.0, [True, True, False])
     assert np.isfinite(last.log_lr[0])
     limits = thresholds(0.01, 0.99)
     nothing = scan._replace(time=3.0, plots=Plots(np.zeros((0, 2))))
     (last,) = extract_cluster(replace(EVERYTHING, limits=limits, hypotheses=1), last, 1.5, [nothing])
     assert (last.log_lr[0], last.status[0]) == (-np.inf, DELETED)
-    np.testing.assert_array_equal(last.cardinality, [0.5, 0.5])
+    np.testing.assert_array_equal(last.cardinality, 1.0 / np.full(3, 3.0))
+
+
+def test_padding_is_no_plot() -> None:
+    (scan,) = scans_of(9, [3], [NEAR])
+    plots = Plots(np.concatenate([scan.plots.z, np.zeros((2, 2))]), np.array([True, True, True, False, False]))
+    (plain,) = extract_cluster(EVERYTHING, cluster(stacked(PRIOR), 2), 0.0, [scan])
+    (padded,) = extract_cluster(EVERYTHING, cluster(stacked(PRIOR), 2), 0.0, [scan._replace(plots=plots)])
+    np.testing.assert_allclose(padded.log_lr_n, plain.log_lr_n, rtol=1e-12)
 
 
 def test_scans_must_be_in_order() -> None:

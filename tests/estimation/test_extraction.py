@@ -226,7 +226,9 @@ def test_candidates_together_are_the_candidates_apart(seed: int) -> None:
         for said in extract(extractor, prior, 0.0, scans):
             apart[int(said.ids[0]), int(said.scans[0])] = (said.log_lr[0], said.status[0])
     both = {}
-    for said in extract(extractor, together(together(*priors[:2]), priors[2]), 0.0, scans):
+    start = together(together(*priors[:2]), priors[2])
+    np.testing.assert_allclose(np.exp(start.log_lambda), [[1, 0, 0], [1 / 3, 1 / 3, 1 / 3], [1 / 2, 1 / 2, 0]])
+    for said in extract(extractor, start, 0.0, scans):
         for row, number in enumerate(said.ids):
             both[int(number), int(said.scans[row])] = (said.log_lr[row], said.status[row])
     assert both.keys() == apart.keys()

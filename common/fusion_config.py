@@ -107,6 +107,8 @@ def fusion_faults(fusion: Mapping[str, Any], motion_model: Any) -> Iterator[str]
         yield f"fusion.terms: {terms} terms of a report need association = 'mirrored'"
     if motion_model == "imm" and mixture:
         yield "fusion: several motion models ('imm') are for a single Gaussian each: no 'mirrored', no 'mht'"
+    if mode == "dkf" and motion_model == "imm":
+        yield "fusion.mode: 'dkf' predicts with one motion model, [motion] has several ('imm')"
     if mode == "selected" and ("association" in fusion or feedback != "none"):
         yield "fusion.mode: 'selected' has no factors: no association, no feedback"
     if mode == "dkf" and (mixture or feedback == "reset"):

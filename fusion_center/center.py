@@ -46,6 +46,7 @@ from fusion_center.state import (
     Member,
     Presence,
     State,
+    Told,
     Waiting,
 )
 
@@ -176,10 +177,10 @@ class Center:
         """Answer a sensor with the tracks; one whose process is new gets its own last factors back."""
         number = self.names.index(join.sensor)
         member = state.members[number]
-        epoch = member.epoch
-        lineage = member.lineage
+        epoch, lineage = member.epoch, member.lineage
+        picture, newest = self._newest(state)
         if not member.joined or join.incarnation != member.incarnation:
-            epoch, lineage = self._next_epoch(state), state.lineage
+            epoch, lineage = self._next_epoch(state), newest
         member = Member(
             joined=True,
             alive=True,
@@ -189,15 +190,22 @@ class Center:
             lineage=lineage,
         )
         state = state.with_member(number, member)
-        answer: list[Message] = [self._start(state.picture, number, epoch)]
+        answer: list[Message] = [self._start(picture, number, epoch)]
         if state.clock is not None:
             advice = self._advice(state) if state.history and self.fusion.feedback == "advice" else []
             answer += [*advice, state.clock]
         return state, answer
 
     def _next_epoch(self, state: State) -> int:
-        told = [rebase.epoch for rebase in state.told]
+        told = [told.rebase.epoch for told in state.told]
         return 1 + max(self.first_epoch, *(member.epoch for member in state.members), *told)
+
+    def _newest(self, state: State) -> tuple[Picture, int]:
+        """The newest picture and its lineage, after the rebase that the nodes are about to follow."""
+        followed = self._followed(state, state.told[-1].rebase.epoch) if state.told else None
+        if followed is None:
+            return state.picture, state.lineage
+        return self.fuser.rebased(state.picture, followed[1], followed[0]), followed[0].epoch
 
     def _start(self, picture: Picture, number: int, epoch: int) -> Start:
         """The live tracks for one sensor."""
@@ -210,7 +218,7 @@ class Center:
         if report.sensor not in self.names:
             return None
         member = state.members[self.names.index(report.sensor)]
-        told = any(report.epoch == rebase.epoch > member.epoch for rebase in state.told)
+        told = any(report.epoch == told.rebase.epoch > member.epoch for told in state.told)
         if not member.joined or not (report.epoch == member.epoch or told) or report.next_ns <= report.time_ns:
             return None
         if self._ahead(state.clock, report.time_ns, now_ns):
@@ -228,6 +236,7 @@ class Center:
         report = heard.report
         number = self.names.index(report.sensor)
         member = state.members[number]
+        heard = heard._replace(lineage=self._lineage(state, number, report))
         # It does not show that its sensor is there: the end of a token may overtake the last reports.
         state = state.with_member(number, member._replace(next_ns=max(member.next_ns, report.next_ns)))
         if report.time_ns <= state.time_ns:
@@ -259,31 +268,32 @@ class Center:
         return state, [*_corrections(before, after), *pictures]
 
     def _work_in(self, state: State, time_ns: int, reports: Mapping[int, AnyHeard]) -> State:
-        lineages = {number: self._lineage(state, number, heard.report) for number, heard in reports.items()}
-        rebase = self._followed(state, max(lineages.values()))
-        if rebase is None:
+        followed = self._followed(state, max(heard.lineage for heard in reports.values()))
+        if followed is None:
             lineage, expected = state.lineage, self._expected(state, time_ns)
         else:
-            then = next(past.picture for past in state.history if past.time_ns == rebase.time_ns)
+            rebase, then = followed
             lineage = rebase.epoch
             expected = self.fuser.expect(self.fuser.rebased(state.picture, then, rebase), time_ns)
         # A node that has not followed yet speaks of factors that are no more.
-        heard = {number: report for number, report in reports.items() if lineages[number] == lineage}
+        heard = {number: heard for number, heard in reports.items() if heard.lineage == lineage}
         picture, decisions = self.fuser.advance(expected, heard)
         checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), lineage)
         return state._replace(history=(*state.history, checkpoint))
 
     def _lineage(self, state: State, number: int, report: Report | Picked) -> int:
         """Epoch of the rebase that a report's factors descend from."""
-        followed = any(rebase.epoch == report.epoch for rebase in state.told)
+        followed = any(told.rebase.epoch == report.epoch for told in state.told)
         return report.epoch if followed else state.members[number].lineage
 
-    def _followed(self, state: State, lineage: int) -> Rebase | None:
-        """The rebase of a lineage, if it is newer than that of the picture."""
-        if lineage <= state.lineage:
-            return None
-        times = {past.time_ns for past in state.history}
-        return next((told for told in state.told if told.epoch == lineage and told.time_ns in times), None)
+    def _followed(self, state: State, lineage: int) -> tuple[Rebase, Picture] | None:
+        """The rebase of a lineage, if it is newer than that of the picture, and the picture of its time."""
+        for rebase, then in state.told:
+            if rebase.epoch == lineage > state.lineage:
+                pictures = {past.time_ns: past.picture for past in state.history}
+                picture = pictures.get(rebase.time_ns, then)
+                return None if picture is None else (rebase, picture)
+        return None
 
     def _expected(self, state: State, time_ns: int) -> AnyExpected:
         """The newest picture at a later time: as it was prepared, where that still holds."""
@@ -302,7 +312,9 @@ class Center:
             return state._replace(first_join_ns=since_ns), []
         first_ns = min(member.next_ns for member in joined)
         start_ns = self.epoch_ns if first_ns == NEVER else first_ns
-        clock = Clock(time_ns=start_ns, wall_ns=now_ns + _LEAD_NS, speed=self.speed, clear_ns=start_ns)
+        # In lockstep nothing is worked in yet, or nodes would not wait for the feedback of the first measurement time.
+        time_ns = start_ns if self.speed > 0.0 else start_ns - 1
+        clock = Clock(time_ns=time_ns, wall_ns=now_ns + _LEAD_NS, speed=self.speed, clear_ns=start_ns)
         return state._replace(clock=clock), [clock]
 
     def _release(self, state: State, now_ns: int) -> tuple[State, list[Message]]:
@@ -331,10 +343,15 @@ class Center:
         gone, state = state.history[:keep], state._replace(history=state.history[keep:])
         if not gone:
             return state, []
-        told = tuple(rebase for rebase in state.told if rebase.time_ns > gone[-1].time_ns)
-        state = state._replace(
-            base=gone[-1].picture, base_ns=gone[-1].time_ns, base_lineage=gone[-1].lineage, told=told
+        base = gone[-1]
+        pictures = {past.time_ns: past.picture for past in gone}
+        # A node that was cut off longer than this follows the newest; the factors of now descend from their own.
+        told = tuple(
+            Told(rebase, pictures.get(rebase.time_ns, then))
+            for rebase, then in state.told
+            if rebase.epoch == base.lineage or rebase.given_ns > base.time_ns - self._window_ns
         )
+        state = state._replace(base=base.picture, base_ns=base.time_ns, base_lineage=base.lineage, told=told)
         deleted = [checkpoint.picture.ids[checkpoint.picture.status == DELETED] for checkpoint in gone]
         if not any(map(len, deleted)):
             return state, []
@@ -369,7 +386,10 @@ class Center:
         if self.fusion.feedback != "reset":
             return state, []
         rebase = Rebase(self._next_epoch(state), state.time_ns, *self._given(state))
-        return state._replace(told=(*state.told, rebase)), [rebase]
+        if all(past.time_ns != rebase.time_ns for past in state.history):
+            # Nothing is old enough. In lockstep the nodes wait until they are told so; no node follows epoch 0.
+            return state, [rebase._replace(epoch=0)]
+        return state._replace(told=(*state.told, Told(rebase))), [rebase]
 
     def _given(self, state: State) -> tuple[int, IntArray, Array, Array]:
         """Time and fused live tracks that feedback is about: the newest that are as old as its delay."""

@@ -39,7 +39,8 @@ class Picture(NamedTuple):
         log_lr_total: since the start, shape (T,).
         log_p_bar: cumulative, as last reported, of all terms of a factor, shape (T, S).
         log_a: relative weights of the terms, shape (T, S, K); -inf is no term.
-        reported: which sensors ever reported the track, shape (T, S).
+        reported: which sensors' factors are no more the prior predicted: they reported the track, or were rebased,
+            shape (T, S).
         contributing: which sensors reported it at the newest time, shape (T, S).
         x, P: terms of the factors, shapes (T, S, K, n), (T, S, K, n, n).
         fused_x, fused_P: the product (Eq. 9), shapes (T, n), (T, n, n).
@@ -75,6 +76,7 @@ class Heard(NamedTuple):
         log_a: relative weights of the terms, shape (T, K).
         P: of the terms, shape (T, K, n, n).
         factors: the terms, shapes (T, K, n), (T, K, n, n), (T, K).
+        lineage: epoch of the rebase that they descend from; 0: none.
     """
 
     report: Report
@@ -82,6 +84,7 @@ class Heard(NamedTuple):
     log_a: Array
     P: Array
     factors: Whitened
+    lineage: int = 0
 
     @classmethod
     def of(cls, report: Report) -> Heard:
@@ -305,13 +308,16 @@ class Fuser:
         assert len(then.ids[old]) == len(now.ids[rows]), "a track that was told of was there"
         log_a, (x, P) = self._shares(Gaussian(told.x[given], told.P[given]))
         part = take(now, rows) if not isinstance(rows, slice) else now
-        gained = then.log_lr_total[old] - part.log_lr_total
+        total, possible = then.log_lr_total[old], part.log_lr_total > -np.inf
+        # What confirmations took from log LR since stays taken.
+        taken = np.subtract(part.log_lr_total, part.log_lr, out=np.zeros_like(total), where=possible)
         part = part._replace(
             times_ns=np.full_like(part.times_ns, told.time_ns),
-            log_lr=part.log_lr + gained,
-            log_lr_total=part.log_lr_total + gained,
+            log_lr=np.where(possible, total - taken, then.log_lr[old]),
+            log_lr_total=total,
             log_p_bar=np.zeros_like(part.log_p_bar),
             log_a=log_a,
+            reported=np.ones_like(part.reported),
             x=x,
             P=P,
             fused_x=told.x[given],

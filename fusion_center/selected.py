@@ -27,10 +27,12 @@ class HeardPlots(NamedTuple):
     Attributes:
         report: as it came.
         plots: z of shape (T, 1, K, m), padded.
+        lineage: of factors, which there are none of.
     """
 
     report: Picked
     plots: Plots
+    lineage: int = 0
 
 
 class ExpectedTracks(NamedTuple):
@@ -160,7 +162,7 @@ class SelectedFuser:
         picture, mixture = expected.moving, expected.mixture
         who = np.zeros(picture.reported.shape, np.bool_)
         for number in sorted(reports):
-            report, plots = reports[number]
+            report, plots, _ = reports[number]
             rows, others = common(picture.ids, report.ids)
             who[rows, number] = True
             assert plots.valid is not None

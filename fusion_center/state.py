@@ -99,6 +99,18 @@ class Checkpoint(NamedTuple):
     lineage: int = 0
 
 
+class Told(NamedTuple):
+    """A rebase that the nodes were told of.
+
+    Attributes:
+        rebase: as they were told.
+        then: the picture of its time, once that is no more in the history.
+    """
+
+    rebase: Rebase
+    then: Picture | None = None
+
+
 class Waiting(NamedTuple):
     """Reports of one measurement time not worked in yet.
 
@@ -140,7 +152,7 @@ class State(NamedTuple):
         base_lineage: its lineage.
         history: checkpoints inside the window, oldest first.
         counts: of reports.
-        told: the rebases that the nodes were told of, oldest first, as far back as the history goes.
+        told: the rebases that reports may descend from, oldest first.
         expected: worked out ahead for the next measurement time, or None. It saves time and changes nothing.
     """
 
@@ -153,7 +165,7 @@ class State(NamedTuple):
     history: tuple[Checkpoint, ...]
     counts: Counts
     base_lineage: int = 0
-    told: tuple[Rebase, ...] = ()
+    told: tuple[Told, ...] = ()
     expected: AnyExpected | None = None
 
     @property

@@ -15,6 +15,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from studies.parts import write_atomically
+from studies.plan import Variant
 from studies.progress import figure as words
 from studies.report_figures import (
     Scene,
@@ -98,7 +99,8 @@ SHEETS = (
         "Calibration",
         "Share of the runs without a target in which the LR reached B before the scenario's end; shaded: "
         "Clopper-Pearson bounds of 95 %. For an exact LR the probability is at most 1/B (Ville), the grey line: a band "
-        "that is all above it tells of an LR that is too sure.",
+        "that is all above it tells of an LR that is too sure. Dashed, where centralised-mht played with a target too: "
+        "importance sampling, from runs with a target that count with the inverse of that mode's LR.",
         draw_calibration,
         needs=False,
     ),
@@ -188,7 +190,13 @@ def scene_of(study: Study, outcome: Outcome) -> Scene:
         p1=decision.p1,
         limits=decision.thresholds,
         n=study.scenario.motion.build().n,
+        twins={bare.name: twin.name for bare in study.variants for twin in study.variants if _twins(bare, twin)},
     )
+
+
+def _twins(bare: Variant, twin: Variant) -> bool:
+    """Whether two variants differ in the target only, which the first one lacks."""
+    return twin.has_target and not bare.has_target and twin.scenario.sensors == bare.scenario.sensors
 
 
 def _draw(sheet: Sheet, scene: Scene, folder: Path) -> str:

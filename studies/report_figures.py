@@ -35,6 +35,7 @@ class Scene(NamedTuple):
         p1: accept h1 under h1, of the scenario.
         limits: thresholds of the scenario.
         n: size of the state.
+        twins: for a variant without target, the one that differs in its target only, if it is there.
     """
 
     outcome: Outcome
@@ -44,6 +45,7 @@ class Scene(NamedTuple):
     p1: float
     limits: Thresholds
     n: int
+    twins: dict[str, str]
 
     @property
     def with_target(self) -> list[str]:
@@ -255,19 +257,33 @@ def draw_calibration(scene: Scene) -> Figure:
     for variant, block in zip(names, np.split(axes, len(names)), strict=True):
         table = rows_of(scene.outcome.calibration, variant=variant, method="direct")
         floor = 0.3 / int(table["runs"][0])
+        twin = scene.twins.get(variant, "")
+        rare = rows_of(scene.outcome.calibration, variant=twin, method="importance") if twin else {}
+        rare = rare if rare and len(rare["b"]) else {}
+        lowest = 1e-7 if rare else floor
         for number, panel in enumerate(block.ravel()):
             if number >= len(scene.modes):
                 panel.set_axis_off()
                 continue
             mode = scene.modes[number]
             _draw_share(panel, rows_of(table, mode=mode), mode, floor)
-            panel.set(title=f"{variant}: {mode}" if number == 0 and len(names) > 1 else mode, ylim=(floor, 1.2))
+            if rare:
+                _draw_rare(panel, rows_of(rare, mode=mode), mode)
+            panel.set(title=f"{variant}: {mode}" if number == 0 and len(names) > 1 else mode, ylim=(lowest, 1.2))
             if number + columns >= len(scene.modes):
                 panel.set_xlabel("B")
                 panel.tick_params(labelbottom=True)
         for panel in block[:, 0]:
             panel.set_ylabel("P(sup LR ≥ B)")
     return figure
+
+
+def _draw_rare(axes: Axes, rows: Table, mode: str) -> None:
+    """The same from runs with a target."""
+    drawn = look(mode)
+    axes.fill_between(rows["b"], np.maximum(rows["low"], 1e-9), rows["high"], color=QUIET, alpha=0.25, lw=0)
+    axes.plot(rows["b"], rows["bound"], color=QUIET, lw=1.2)
+    axes.plot(rows["b"], _positive(rows["share"]), color=drawn.colour, lw=1.2, ls="--")
 
 
 def _draw_share(axes: Axes, rows: Table, mode: str, floor: float) -> None:

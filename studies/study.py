@@ -110,9 +110,14 @@ class Study:
         """Work out all tables from the parts."""
         summary, curves, decisions, calibrations, runs = [], [], [], [], []
         for variant in self.variants:
+            exact = None
+            if variant.has_target and calibration.EXACT in self.order.modes:
+                exact = tables.judge(self._gather(variant, calibration.EXACT))
             for mode in self.order.modes:
                 play = self._gather(variant, mode)
                 judged = tables.judge(play)
+                if exact is not None:
+                    calibrations.append(calibration.by_importance(judged, exact))
                 summary.append(tables.summary_table(judged))
                 curves.append(tables.curves_table(judged))
                 decisions.append(tables.decisions_table(play))

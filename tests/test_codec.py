@@ -20,7 +20,9 @@ from common.messages import (
     Join,
     Keys,
     Message,
+    Picked,
     Proposal,
+    Rebase,
     Report,
     Scan,
     Start,
@@ -77,7 +79,12 @@ def start(tracks: int, n: int = 4) -> Start:
 
 def advice(tracks: int, n: int = 4) -> Advice:
     rng = np.random.default_rng(tracks)
-    return Advice(EPOCH_NS, ids(tracks), rng.standard_normal((tracks, n)), covariances(rng, tracks, n))
+    x, P = rng.standard_normal((tracks, n)), covariances(rng, tracks, n)
+    return Advice(EPOCH_NS + 1, EPOCH_NS, ids(tracks), x, P)
+
+
+def rebase(tracks: int, n: int = 4) -> Rebase:
+    return Rebase(9, *advice(tracks, n))
 
 
 def picture(tracks: int, n: int = 4, sensors: int = 3) -> Tracks:
@@ -106,6 +113,24 @@ def proposal(tracks: int, n: int = 4) -> Proposal:
     return Proposal("radar-1", EPOCH_NS, rng.standard_normal((tracks, n)), covariances(rng, tracks, n))
 
 
+def picked(tracks: int, plots: int, m: int = 2) -> Picked:
+    """Plot i goes to every track whose number is no multiple of i + 2."""
+    rng = np.random.default_rng(tracks)
+    which = [np.flatnonzero(track % np.arange(2, plots + 2)) for track in range(tracks)]
+    return Picked(
+        sensor="radar-1",
+        sequence=3,
+        time_ns=EPOCH_NS,
+        next_ns=EPOCH_NS + 1,
+        epoch=1,
+        position=rng.standard_normal(m),
+        ids=ids(tracks),
+        plots=np.array([len(own) for own in which], np.int64),
+        which=np.concatenate([np.empty(0, np.int64), *which]),
+        z=rng.standard_normal((plots, m)).astype(np.float32).astype(np.float64),
+    )
+
+
 def rounded(message: Report) -> Report:
     """A report whose densities fit into single precision."""
     x, P = (array.astype(np.float32).astype(np.float64) for array in (message.x, message.P))
@@ -119,6 +144,8 @@ MESSAGES: dict[str, Message] = {
     "report-mixed-terms": report(1, terms=6)._replace(ids=ids(3), terms=np.array([1, 2, 3])),
     "report-impossible": report(2)._replace(log_g=np.array([-np.inf, -1.0])),
     "report-last": report(1)._replace(next_ns=NEVER),
+    **{f"picked-{t}-{m}": picked(t, m) for t, m in ((0, 0), (1, 0), (1, 3), (100, 7))},
+    "picked-3d": picked(3, 4, m=3),
     **{f"scan-{m}": scan(m) for m in (0, 1, 100)},
     "scan-3d": scan(2, d=3),
     **{f"proposal-{t}": proposal(t) for t in (0, 1, 100)},
@@ -130,6 +157,9 @@ MESSAGES: dict[str, Message] = {
     "start-impossible": start(1)._replace(log_p_bar=np.array([-np.inf])),
     **{f"stop-{t}": Stop("radar-1", ids(t)) for t in (0, 1, 100)},
     **{f"advice-{t}": advice(t) for t in (0, 1, 100)},
+    "advice-3d": advice(2, n=6),
+    **{f"rebase-{t}": rebase(t) for t in (0, 1, 100)},
+    "rebase-3d": rebase(2, n=6),
     "clock": Clock(EPOCH_NS, EPOCH_NS + 1, 10.0, EPOCH_NS),
     "clock-never": Clock(-1, 0, 0.0, NEVER),
     **{f"tracks-{t}": picture(t) for t in (0, 1, 100)},
@@ -213,10 +243,17 @@ GOLDEN_START = Start(
     x_a=np.array([[3.0, 4.0]]),
     P_a=np.array([[[2.0, 0.0], [0.0, 2.0]]]),
 )
+GOLDEN_ADVICE = Advice(
+    given_ns=12,
+    time_ns=10,
+    ids=np.array([7]),
+    x=np.array([[1.0, 2.0]]),
+    P=np.array([[[4.0, 1.0], [1.0, 3.0]]]),
+)
 GOLDEN = [
     (
         GOLDEN_REPORT,
-        "95 01 01"  # version, kind
+        "95 02 01"  # version, kind
         "94 03 0a cf7fffffffffffffff 02"  # sequence, time, next, epoch
         "93 01 01 02"  # T, N, n
         "c4 35 07000000 01"  # bin; ids, terms
@@ -226,17 +263,29 @@ GOLDEN = [
     ),
     (
         GOLDEN_START,
-        "95 01 04 91 02 92 01 02"  # version, kind, epoch, T, n
+        "95 02 04 91 02 92 01 02"  # version, kind, epoch, T, n
         "c4 64 07000000 0201000000000000"  # bin; ids, times
         "000000000000e0bf"  # log_p_bar
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840"  # x, P
         "0000000000000840 0000000000001040 0000000000000040 0000000000000000 0000000000000040",  # x_a, P_a
     ),
+    (
+        GOLDEN_ADVICE,
+        "95 02 06 92 0c 0a 92 01 02"  # version, kind, given, time, T, n
+        "c4 2c 07000000"  # bin; ids
+        "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840",  # x, P
+    ),
+    (
+        Rebase(5, *GOLDEN_ADVICE),
+        "95 02 0c 93 05 0c 0a 92 01 02"  # version, kind, epoch, given, time, T, n
+        "c4 2c 07000000"  # bin; ids
+        "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840",  # x, P
+    ),
 ]
 
 
 GOLDEN_ROUNDED = (
-    "95 01 0a 94 03 0a cf7fffffffffffffff 02 93 01 01 02"
+    "95 02 0a 94 03 0a cf7fffffffffffffff 02 93 01 01 02"
     "c4 21 07000000 01 000000000000e0bf"  # log_g in full
     "0000803f 00000040 00008040 0000803f 00004040"  # x, P
 )
@@ -248,15 +297,24 @@ def test_the_bytes_of_a_rounded_report_never_change() -> None:
     assert same(decode(KEYS.of(GOLDEN_REPORT), payload), GOLDEN_REPORT)
 
 
-@pytest.mark.parametrize(("message", "golden"), GOLDEN, ids=["report", "start"])
-def test_the_bytes_of_version_1_never_change(message: Message, golden: str) -> None:
+@pytest.mark.parametrize(("message", "golden"), GOLDEN, ids=["report", "start", "advice", "rebase"])
+def test_the_bytes_of_version_2_never_change(message: Message, golden: str) -> None:
     payload = bytes.fromhex(golden)
     assert encode(message) == payload
     assert same(decode(KEYS.of(message), payload), message)
 
 
 #: Bytes per track, plot or term at 100 of them, 2-D and three sensors: one more number in a message breaks its budget.
-BUDGETS = {"report": 126, "tracks": 142, "start": 245, "advice": 117, "proposal": 113, "scan": 17, "stop": 5}
+BUDGETS = {
+    "report": 126,
+    "tracks": 142,
+    "start": 245,
+    "advice": 117,
+    "rebase": 117,
+    "proposal": 113,
+    "scan": 17,
+    "stop": 5,
+}
 
 
 @pytest.mark.parametrize(("name", "budget"), BUDGETS.items())
@@ -285,7 +343,7 @@ def test_only_reports_are_rounded() -> None:
     assert encode(start(3), rounded=True) == encode(start(3))
 
 
-@pytest.mark.parametrize("version", [0, VERSION + 1, 7, -1, 2**64 - 1])
+@pytest.mark.parametrize("version", [0, VERSION - 1, VERSION + 1, 7, -1, 2**64 - 1])
 def test_another_version_is_refused_whatever_follows(version: int) -> None:
     for payload in (msgpack.packb([version]), altered(report(1), version=version)):
         with pytest.raises(VersionError) as caught:
@@ -317,7 +375,7 @@ def floats(message: Message) -> list[str]:
 
 FLOATS = [
     (message, name)
-    for message in (report(1), scan(1), proposal(1), start(1), advice(1), picture(1))
+    for message in (report(1), scan(1), proposal(1), start(1), advice(1), rebase(1), picture(1))
     for name in floats(message)
 ]
 FLOAT_NAMES = [f"{type(message).__name__}.{name}" for message, name in FLOATS]
@@ -358,8 +416,8 @@ ENVELOPES = [
     ("empty array", msgpack.packb([]), "expected an array that starts with the version"),
     ("version as text", msgpack.packb(["1"]), "expected an array that starts with the version"),
     ("version as truth", msgpack.packb([True]), "expected an array that starts with the version"),
-    ("too short", msgpack.packb([1, 1]), "2 elements, expected 5: version, kind, scalars, sizes, blocks"),
-    ("too long", msgpack.packb([1, 1, [], [], b"", 0]), "6 elements, expected 5"),
+    ("too short", msgpack.packb([VERSION, 1]), "2 elements, expected 5: version, kind, scalars, sizes, blocks"),
+    ("too long", msgpack.packb([VERSION, 1, [], [], b"", 0]), "6 elements, expected 5"),
     ("kind unknown", altered(GOLDEN_REPORT, kind=99), "kind 99 is unknown"),
     ("kind as truth", altered(GOLDEN_REPORT, kind=True), "kind True is unknown"),
     ("scalars missing", altered(GOLDEN_REPORT, scalars=[1, 2]), "expected the 4 scalars of a Report"),
@@ -410,7 +468,7 @@ def test_an_unknown_status_is_refused() -> None:
 
 
 def test_a_refusal_is_short_whatever_was_sent() -> None:
-    assert len(refusal(msgpack.packb([1, "x" * 100_000, [], [], b""]))) < 1000
+    assert len(refusal(msgpack.packb([VERSION, "x" * 100_000, [], [], b""]))) < 1000
 
 
 # Fuzzed bytes ---------------------------------------------------------------------------------------------------------
@@ -449,7 +507,10 @@ def test_random_bytes(key: str, payload: bytes) -> None:
     survives(key, payload)
 
 
-@pytest.mark.parametrize("name", ["report-1", "scan-1", "join", "start-1", "stop-1", "advice-1", "clock", "tracks-1"])
+TRUNCATED = ["report-1", "scan-1", "join", "start-1", "stop-1", "advice-1", "rebase-1", "clock", "tracks-1"]
+
+
+@pytest.mark.parametrize("name", TRUNCATED)
 def test_truncated_bytes(name: str) -> None:
     message = MESSAGES[name]
     payload = encode(message)
@@ -474,7 +535,7 @@ def test_random_structures(key: str, content: Any) -> None:
 
 
 @FUZZ
-@given(any_key, st.integers(0, 10), structure, structure, structure)
+@given(any_key, st.integers(0, max(LAYOUTS) + 1), structure, structure, structure)
 def test_random_bodies(key: str, kind: int, scalars: Any, sizes: Any, blocks: Any) -> None:
     survives(key, msgpack.packb([VERSION, kind, scalars, sizes, blocks]))
 
@@ -506,12 +567,14 @@ def test_every_message_has_its_key() -> None:
     keys = {type(message).__name__: KEYS.of(message) for message in MESSAGES.values()}
     assert keys == {
         "Report": "waldnet/coast/sensor/radar-1/report",
+        "Picked": "waldnet/coast/sensor/radar-1/report",
         "Scan": "waldnet/coast/sensor/radar-1/plots",
         "Proposal": "waldnet/coast/sensor/radar-1/proposal",
         "Join": "waldnet/coast/sensor/radar-1/join",
         "Start": "waldnet/coast/center/command/radar-1",
         "Stop": "waldnet/coast/center/command/radar-1",
         "Advice": "waldnet/coast/center/advice",
+        "Rebase": "waldnet/coast/center/advice",
         "Clock": "waldnet/coast/center/clock",
         "Tracks": "waldnet/coast/center/tracks",
         "Decision": "waldnet/coast/center/decision",
@@ -534,3 +597,23 @@ def test_every_message_has_its_key() -> None:
 )
 def test_the_sensor_of_a_key(key: str, sensor: str) -> None:
     assert sensor_of(key) == sensor
+
+
+def test_picked_plots_are_rounded_on_request() -> None:
+    message = picked(3, 4)
+    payload = encode(message, rounded=True)
+    assert same(decode(KEYS.report("radar-1"), payload), message)  # they fit into single precision
+    assert len(encode(message)) - len(payload) == 4 * message.z.size
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"plots": np.array([3])}, "3 plots of tracks, 2 places sent among 2 plots"),
+        ({"which": np.array([0, 2])}, "2 plots of tracks, 2 places sent among 2 plots"),
+    ],
+)
+def test_plots_that_are_not_there_are_refused(changes: dict[str, Any], fault: str) -> None:
+    message = picked(1, 2)._replace(plots=np.array([2]), which=np.array([0, 1]), z=np.zeros((2, 2)))
+    with pytest.raises(DecodeError, match=fault):
+        decode(KEYS.report("radar-1"), encode(message._replace(**changes)))

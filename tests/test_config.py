@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 
 from common.config import Network, Scenario, load_network, load_scenario
 from common.errors import ConfigError
+from common.estimation.association import Choice, kalman, nearest, normalise
 from common.estimation.field_of_view import Box, Disc, Everywhere
+from common.estimation.mixture import Reduction
 from scenarios import catalogue
 
 GOOD = """\
@@ -149,7 +151,9 @@ field_of_view = { shape = "disc", radius = 1 }
     assert loaded.motion.dimensions == 2
     assert (loaded.decision.p0, loaded.decision.p1, loaded.decision.enabled) == (1e-4, 0.95, True)
     fusion = loaded.fusion
-    assert (fusion.mode, fusion.association, fusion.feedback, fusion.filter) == ("federated", "tight", "none", "pdaf")
+    assert (fusion.mode, fusion.association, fusion.feedback, fusion.filter) == ("federated", "tight", "none", None)
+    assert (fusion.terms, fusion.feedback_delay) == (1, 0.0)
+    assert fusion.mixture.build() == Reduction(15, 1e-4, 0.5)
     assert (loaded.network.name, loaded.network.mode, loaded.network.multicast) == ("least", "peer", False)
     assert (loaded.sensors[0].scan_interval, loaded.sensors[0].first_scan) == (1.0, None)
     assert (loaded.simulation, loaded.recording, loaded.targets, loaded.hypotheses) == (None, None, (), ())
@@ -163,6 +167,15 @@ def test_the_recording_is_beside_the_scenario(tmp_path: Path) -> None:
     assert absolute is not None
     assert absolute.plots == Path("/data/plots.jsonl")
 
+
+ADVICE_NEEDS = (
+    "fusion.feedback: 'advice' steers the association filter of a single Gaussian, "
+    "which only association = 'tight' with another filter than 'mht' has"
+)
+DKF_NEEDS = "fusion.mode: 'dkf' needs covariances that do not depend on data: no mixture, no feedback = 'reset'"
+MIRRORED_ADVICE = 'association = "mirrored"\nfeedback = "advice"'
+DKF_MHT = 'mode = "dkf"\nfilter = "mht"'
+DKF_MIRRORED = 'mode = "dkf"\nassociation = "mirrored"'
 
 FAULTS = [
     # the whole
@@ -204,13 +217,67 @@ FAULTS = [
     ("p0 = 1e-3", "p0 = 0.9", "decision.p1: 0.9 is not above p0 = 0.9; no threshold lies between"),
     ("p1 = 0.9", "p1 = 1e-4", "decision.p1: 0.0001 is not above p0 = 0.001; no threshold lies between"),
     # fusion
-    ('mode = "federated"', 'mode = "best"', "fusion.mode: 'best' is not one of 'naive', 'federated' or 'dkf'"),
+    (
+        'mode = "federated"',
+        'mode = "best"',
+        "fusion.mode: 'best' is not one of 'naive', 'federated', 'dkf' or 'selected'",
+    ),
     (
         'association = "tight"\nfeedback = "advice"',
         'association = "loose"',
-        "fusion.association: 'loose' is not one of 'factor' or 'tight'",
+        "fusion.association: 'loose' is not one of 'factor', 'tight' or 'mirrored'",
     ),
-    ('filter = "pdaf"', 'filter = "mht"', "fusion.filter: 'mht' is not one of 'pdaf'"),
+    (
+        'filter = "pdaf"',
+        'filter = "imm"',
+        "fusion.filter: 'imm' is not one of 'kalman', 'nearest', 'pdaf' or 'mht'",
+    ),
+    ('feedback = "advice"', 'feedback = "loop"', "fusion.feedback: 'loop' is not one of 'none', 'advice' or 'reset'"),
+    ('filter = "pdaf"', 'filter = "mht"', ADVICE_NEEDS),
+    ('filter = "pdaf"', "terms = 3", "fusion.terms: 3 terms of a report need association = 'mirrored'"),
+    ('filter = "pdaf"', "terms = 0", "fusion.terms: got 0: input should be greater than or equal to 1"),
+    (
+        'association = "tight"\nfeedback = "advice"\nfilter = "pdaf"',
+        'association = "mirrored"\nterms = 65',
+        "fusion.terms: got 65: input should be less than or equal to 64",
+    ),
+    ('filter = "pdaf"', "terms = 1.5", "fusion.terms: got 1.5: input should be a valid integer"),
+    (
+        'association = "tight"\nfeedback = "advice"',
+        'association = "mirrored"',
+        "fusion.filter: 'pdaf' keeps one hypothesis; association = 'mirrored' needs 'mht', or no filter key",
+    ),
+    ('association = "tight"\nfeedback = "advice"\nfilter = "pdaf"', MIRRORED_ADVICE, ADVICE_NEEDS),
+    ('mode = "federated"\nassociation = "tight"\nfeedback = "advice"', 'mode = "dkf"\nfeedback = "reset"', DKF_NEEDS),
+    ('mode = "federated"\nassociation = "tight"\nfeedback = "advice"\nfilter = "pdaf"', DKF_MHT, DKF_NEEDS),
+    ('mode = "federated"\nassociation = "tight"\nfeedback = "advice"\nfilter = "pdaf"', DKF_MIRRORED, DKF_NEEDS),
+    (
+        "window = 5.0",
+        "window = 5.0\nfeedback_delay = 5.5",
+        "fusion.feedback_delay: 5.5 s is longer than the 5.0 s (fusion.window) that nodes keep scans",
+    ),
+    (
+        "window = 5.0",
+        "feedback_delay = 10.5",
+        "fusion.feedback_delay: 10.5 s is longer than the 10.0 s (fusion.window) that nodes keep scans",
+    ),
+    (
+        "window = 5.0",
+        "feedback_delay = -1",
+        "fusion.feedback_delay: -1 is not zero or positive and finite",
+    ),
+    (
+        'filter = "pdaf"',
+        "mixture = { components = 0 }",
+        "fusion.mixture.components: got 0: input should be greater than or equal to 1",
+    ),
+    (
+        'filter = "pdaf"',
+        "mixture = { prune = 1.0 }",
+        "fusion.mixture.prune: got 1.0: input should be less than 1",
+    ),
+    ('filter = "pdaf"', "mixture = { combine = -1 }", "fusion.mixture.combine: -1 is not zero or positive and finite"),
+    ('filter = "pdaf"', "mixture = { rest = true }", "fusion.mixture.rest: is no known key"),
     (
         "gate_probability = 1.0",
         "gate_probability = 0.0",
@@ -221,7 +288,7 @@ FAULTS = [
     (
         'association = "tight"',
         'association = "factor"',
-        "fusion.feedback: 'advice' steers the association filter, which only association = 'tight' has",
+        ADVICE_NEEDS,
     ),
     # sensor
     ("p_d = 0.5", "p_d = 1.4", "sensor.0.p_d: 1.4 is not a probability (0 to 1)"),
@@ -513,6 +580,33 @@ def test_a_sensor_is_found_by_its_name() -> None:
 @pytest.mark.parametrize(("mode", "multiplicity"), [("naive", 1.0), ("federated", 2.0), ("dkf", 2.0)])
 def test_the_share_of_a_sensor(mode: str, multiplicity: float) -> None:
     assert scenario(fusion={"mode": mode}).share.multiplicity == multiplicity
+
+
+@pytest.mark.parametrize(
+    ("fusion", "choice"),
+    [
+        ({}, normalise),
+        ({"filter": "pdaf"}, normalise),
+        ({"filter": "nearest"}, nearest),
+        ({"filter": "kalman"}, kalman),
+        ({"filter": "mht"}, None),
+        ({"association": "mirrored"}, None),
+        ({"association": "mirrored", "filter": "mht"}, None),
+    ],
+)
+def test_the_filter_of_a_network(fusion: dict[str, str], choice: Choice | None) -> None:
+    assert scenario(fusion=fusion).fusion.choice is choice
+
+
+def test_how_far_a_mixture_may_grow(tmp_path: Path) -> None:
+    text = edited(
+        'association = "tight"\nfeedback = "advice"\nfilter = "pdaf"',
+        'association = "mirrored"\nfeedback = "reset"\nfeedback_delay = 5\nterms = 64\n'
+        "mixture = { components = 7, prune = 0.0, combine = 2 }",
+    )
+    fusion = load(tmp_path, text).fusion
+    assert fusion.mixture.build() == Reduction(7, 0.0, 2.0)
+    assert (fusion.feedback, fusion.feedback_delay, fusion.terms) == ("reset", 5.0, 64)
 
 
 def test_fields_of_view() -> None:

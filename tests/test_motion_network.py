@@ -27,20 +27,11 @@ def swept(left: float, q: float) -> tuple[Array, Array]:
     return A, np.diag([0.0, 0.0, q, q])
 
 
-#: Motion table; drift and diffusion of what it says, of several models the mean turn and the psd given.
+#: Motion table; drift and diffusion of what it says.
 MOTIONS: dict[str, tuple[dict[str, Any], tuple[Array, Array]]] = {
     "cv": ({"psd": 2.0}, swept(0.0, 2.0)),
     "ca": ({"model": "ca", "psd": 0.1}, (np.eye(6, k=2), np.diag([0.0] * 4 + [0.1] * 2))),
     "ct": ({"model": "ct", "psd": 2.0, "turn_rate": -0.1}, swept(-0.1, 2.0)),
-    "imm": (
-        {
-            "model": "imm",
-            "psd": 5.0,
-            "sojourn": 9.0,
-            "models": [{"psd": 1.0}, {"model": "ct", "psd": 3.0, "turn_rate": 0.1}],
-        },
-        swept(0.05, 5.0),
-    ),
 }
 
 

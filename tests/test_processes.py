@@ -38,7 +38,7 @@ from process_helpers import (
     variant,
 )
 
-from common.codec import encode
+from common.codec import VERSION, encode
 from common.config import Network, Scenario, load_scenario
 from common.estimation.sprt import Status
 from common.messages import Clock, Join, Keys, Report, Scan, Start, Tracks
@@ -161,6 +161,31 @@ def test_replay_prints_json_lines_of_all_tracks_in_the_order_of_the_hypotheses(l
         ended = statuses.index("deleted") if "deleted" in statuses else len(statuses)
         assert "deleted" not in statuses[:ended]
         assert set(statuses[ended:]) <= {"deleted"}
+
+
+#: What goes between nodes and center beside plain reports.
+ELABORATE = {
+    "reset": 'association = "tight"\nfeedback = "reset"',
+    "mirrored": 'association = "mirrored"\nterms = 3',
+    "mirrored, reset": 'association = "mirrored"\nterms = 3\nfeedback = "reset"',
+    "advice, late": 'association = "tight"\nfeedback = "advice"\nfeedback_delay = 4.0',
+}
+
+
+@pytest.mark.parametrize("fusion", ELABORATE.values(), ids=ELABORATE.keys())
+def test_a_lockstep_run_with_several_hypotheses_or_feedback_says_what_replay_says(
+    processes: Processes, tmp_path: Path, fusion: str
+) -> None:
+    short = ("duration = 60.0", "duration = 16.0")
+    undecided = ("p1 = 0.95", "p1 = 0.95\nenabled = false")
+    path = variant(tmp_path, "elaborate", ('association = "tight"', fusion), short, undecided)
+    run = processes.waldnet("run", path.name, "--speed", "max", "--out", "out")
+    assert run.wait() == 0, run.err
+    assert processes.alive() == {}
+    tracks = points((tmp_path / "out" / "tracks.jsonl").read_text().splitlines())
+    assert_agree(tracks, points(processes.output("replay", path.name, "--json")))
+    (reached, *_) = sorted((time_s for time_s, _ in tracks), reverse=True)
+    assert reached == 16.0
 
 
 def test_a_run_in_real_time_says_what_replay_says(processes: Processes, tmp_path: Path) -> None:
@@ -366,7 +391,7 @@ CLOCK = Clock(time_ns=0, wall_ns=0, speed=0.0, clear_ns=0)
 
 def of_version_99(payload: bytes) -> bytes:
     """The same message of another wire version: the second byte is the version."""
-    assert payload[:2] == b"\x95\x01"
+    assert payload[:2] == bytes([0x95, VERSION])
     return b"\x95\x63" + payload[2:]
 
 
@@ -385,7 +410,7 @@ def test_a_node_refuses_a_center_of_another_wire_version(processes: Processes, k
     assert node.out == []
     assert re.fullmatch(
         rf"the center of this network and this node do not fit together: {key}: \d+ bytes are no message: version 99, "
-        "this program reads 1",
+        rf"this program reads {VERSION}",
         node.err[-1],
     )
 

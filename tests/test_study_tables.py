@@ -118,6 +118,26 @@ def test_calibration_counts_the_runs_that_ever_reached_b() -> None:
     np.testing.assert_allclose(table["bound"] * table["b"], 1.0)
 
 
+def test_calibration_from_runs_with_a_target_tells_the_rate_of_runs_without() -> None:
+    """A normal mean shift, whose exact rate the direct runs tell where they can; 1 / B bounds it everywhere."""
+    rng, steps = np.random.default_rng(3), 40
+    drawn = rng.normal(size=(4000, steps))
+    with_target, without = (np.cumsum(shift + drawn - 0.5, axis=1) for shift in (1.0, 0.0))
+    judged = [judge(play(runs=4000, target=target)) for target in (True, False)]
+    one, none = (
+        case._replace(seen=case.seen._replace(log_lr=log_lr))
+        for case, log_lr in zip(judged, (with_target, without), strict=True)
+    )
+    rare, direct = calibration.by_importance(one, one), calibration.direct(none)
+    assert rare["b"][-1] == pytest.approx(1e6)
+    assert (rare["share"] <= rare["bound"]).all() and (rare["share"][-1] > 0.2 * rare["bound"][-1]).all()
+    at_50 = [np.interp(np.log(50.0), np.log(table["b"]), table["share"]) for table in (rare, direct)]
+    assert at_50[0] == pytest.approx(at_50[1], rel=0.5)  # some 40 of 4000 runs without a target reach it
+    # An LR that is too sure by two is found out where an exact one is not.
+    sure = calibration.by_importance(one._replace(seen=one.seen._replace(log_lr=with_target + 2.0)), one)
+    assert (sure["low"][8:] > sure["bound"][8:]).all()
+
+
 def test_csv_has_every_number_whole_and_nothing_for_none() -> None:
     table = {
         "mode": np.array(["a,b", "c"], dtype=object),

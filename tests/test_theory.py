@@ -1,6 +1,6 @@
 """Whole networks, replayed, against theory.md written out a second time: loops over sensors, plots and tracks.
 
-Nothing of ``common.estimation`` is used here: the reference below comes from the equations.
+Nothing of ``common.estimation`` is used here: the reference below and in ``reference.py`` comes from the equations.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from reference import Array, Density, folded, log_normal, predicted
 from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import chi2, norm
@@ -22,16 +22,10 @@ from sensor_node.tracker import LocalTracker
 from sensor_node.tracker import State as NodeState
 from studies.replay import Replay
 
-Array: TypeAlias = NDArray[np.float64]
 Config: TypeAlias = dict[str, Any]
 
 AREA = 9e6
 PSD = 5.0
-
-
-class Density(NamedTuple):
-    x: Array
-    P: Array
 
 
 class Look(NamedTuple):
@@ -54,37 +48,6 @@ Course: TypeAlias = dict[float, Entry]
 
 
 # ---- the reference
-
-
-def predicted(density: Density, dt: float, psd: float, share: float) -> Density:
-    """Eq. (5): constant velocity, noise of ``share`` times the power spectral density."""
-    d = len(density.x) // 2
-    one, zero = np.eye(d), np.zeros((d, d))
-    F = np.block([[one, dt * one], [zero, one]])
-    Q = psd * np.block([[dt**3 / 3 * one, dt**2 / 2 * one], [dt**2 / 2 * one, dt * one]])
-    return Density(F @ density.x, F @ density.P @ F.T + share * Q)
-
-
-def log_normal(d: Array, S: Array) -> float:
-    """log N(d; 0, S)."""
-    _, log_det = np.linalg.slogdet(2 * np.pi * S)
-    return -0.5 * float(log_det + d @ np.linalg.solve(S, d))
-
-
-def combined(one: Density, other: Density) -> Density:
-    """Eq. (9) of two factors."""
-    J1, J2 = np.linalg.inv(one.P), np.linalg.inv(other.P)
-    P = np.linalg.inv(J1 + J2)
-    return Density(P @ (J1 @ one.x + J2 @ other.x), P)
-
-
-def folded(factors: Sequence[Density]) -> tuple[float, Density]:
-    """Eq. (8) and (9), one sensor after the other."""
-    log_c, fused = 0.0, factors[0]
-    for factor in factors[1:]:
-        log_c += log_normal(factor.x - fused.x, fused.P + factor.P)
-        fused = combined(fused, factor)
-    return log_c, fused
 
 
 def sight(density: Density, sensor: Config) -> float:
@@ -176,8 +139,40 @@ def reference(network: Config, hypothesis: Config, looks: Sequence[Look]) -> Cou
         log_c, fused = folded(factors)
         log_lr += log_c
         now, course[time] = time, Entry(log_lr, *fused)
-        if fusion["feedback"] == "advice":
+        if fusion["feedback"] != "none":
             honest = [fused for _ in sensors]
+        if fusion["feedback"] == "reset":
+            factors = [Density(fused.x, share * fused.P) for _ in sensors]
+    return course
+
+
+def reset_late(network: Config, hypothesis: Config, looks: Sequence[Look], delay: float) -> Course:
+    """One track where, after every measurement time, all begin anew from the fused track of ``delay`` seconds before.
+
+    All sensors scan at the same times.
+    """
+    sensors, fusion, psd = network["sensor"], network["fusion"], float(network["motion"]["psd"])
+    share, start = float(len(sensors)), float(hypothesis["start"])
+    # While nothing is old enough nothing begins anew.
+    course = reference(network | {"fusion": fusion | {"feedback": "none"}}, hypothesis, looks)
+    for last, time in pairwise(course):
+        since = max((past for past in course if past <= last - delay), default=start)
+        if since == start:
+            continue
+        log_lr, *fused = course[since]
+        begun = Density(fused[0], share * fused[1])
+        factors, evidence = [], 0.0
+        for s in range(len(sensors)):
+            factor, honest, now = begun, Density(*fused), since
+            for look in (look for look in looks if look.sensor == s and since < look.time <= time):
+                factor = predicted(factor, look.time - now, psd, share)
+                honest = predicted(honest, look.time - now, psd, 1.0)
+                factor, honest, log_p_bar = filtered(factor, honest, look.plots, sensors[s], fusion)
+                now, evidence = look.time, evidence + log_p_bar
+            factors.append(factor)
+        before, _ = folded([predicted(begun, time - since, psd, share)] * len(sensors))
+        after, density = folded(factors)
+        course[time] = Entry(log_lr + evidence + after - before, *density)
     return course
 
 
@@ -313,7 +308,7 @@ def last(course: Course) -> Entry:
 
 
 @pytest.mark.parametrize("gate_probability", [1.0, 0.9])
-@pytest.mark.parametrize("feedback", ["none", "advice"])
+@pytest.mark.parametrize("feedback", ["none", "advice", "reset"])
 @pytest.mark.parametrize("association", ["factor", "tight"])
 @pytest.mark.parametrize("mode", ["naive", "federated"])
 def test_a_network_is_what_the_equations_say(
@@ -365,6 +360,22 @@ def test_the_variants_of_a_network_differ() -> None:
     assert all(abs(other - plain) > 0.01 for other in others)
 
 
+@pytest.mark.parametrize("delay", [0.0, 2.0, 4.0])
+@pytest.mark.parametrize("association", ["factor", "tight"])
+def test_a_network_that_begins_anew_from_what_was_some_time_ago(association: str, delay: float) -> None:
+    """All sensors scan together, so that every rebase is followed by everyone's evidence since."""
+    network = three_radars(association=association, feedback="reset", feedback_delay=delay)
+    network["hypothesis"] = network["hypothesis"][:2]
+    times = (1.0, 2.0, 3.5, 5.0, 7.0, 8.0, 10.0)
+    looks, few = [], cluttered(network)
+    for s in range(3):
+        own = [look for look in few if look.sensor == s]
+        looks += [look._replace(time=time) for look, time in zip(own, times, strict=False)]
+    ours = courses(network, looks)
+    for track, hypothesis in enumerate(network["hypothesis"]):
+        assert_same(ours[track], reset_late(network, hypothesis, looks, delay))
+
+
 UNLIKE = [((50.0, 50.0), 1.0, 1.0), ((10.0, 80.0), 1.0, 1.0), ((300.0, 20.0), 1.0, 1.0)]
 ASYNCHRONOUS = [((50.0, 50.0), 1.0, 1.0), ((10.0, 80.0), 0.25, 1.75), ((300.0, 20.0), 3.0, 0.5)]
 ALIKE = [((50.0, 50.0), 1.0, 1.0)] * 4
@@ -379,6 +390,22 @@ def test_without_doubt_the_network_is_the_centralised_kalman_filter(
 ) -> None:
     """For the target's track, for the decoy, which is drawn onto the target, and for those that begin late."""
     network, looks = one_plot_each(sensors, mode=mode, association=association)
+    ours = courses(network, looks)
+    for track, hypothesis in enumerate(network["hypothesis"]):
+        assert_same(ours[track], kalman(network, hypothesis, looks))
+
+
+@pytest.mark.parametrize("association", ["factor", "tight", "mirrored"])
+@pytest.mark.parametrize("sensors", [UNLIKE, ASYNCHRONOUS, ALIKE], ids=["unlike", "asynchronous", "alike"])
+def test_without_doubt_a_network_that_begins_anew_is_the_centralised_kalman_filter(
+    sensors: list[tuple[tuple[float, float], float, float]], association: str
+) -> None:
+    """However unlike the sensors are.
+
+    The federated prediction is exact for factors that are alike: n factors N(x, n P) become N(F x, n (F P F' + Q)), the
+    roots of the predicted density. After every scan the reset makes them so, from the exact posterior.
+    """
+    network, looks = one_plot_each(sensors, association=association, feedback="reset")
     ours = courses(network, looks)
     for track, hypothesis in enumerate(network["hypothesis"]):
         assert_same(ours[track], kalman(network, hypothesis, looks))
@@ -533,11 +560,12 @@ def test_advice_however_late_makes_the_association_filter_the_plain_pdaf(delay: 
         scan = Scan("a", scenario.to_ns(look.time), np.zeros(2), look.plots)
         state, _ = tracker.scan(state, scan, NEVER)
         if k > delay:
-            now = {look.time: Entry(0.0, state.tracks.x_a[0], state.tracks.P_a[0])}
+            now = {look.time: Entry(0.0, state.tracks.x_a[0, 0], state.tracks.P_a[0, 0])}
             assert_same(now, {look.time: plain[look.time]._replace(log_lr=0.0)})
         else:
-            assert (np.abs(state.tracks.x_a[0] - plain[look.time].x) > 1e-3).any()
+            assert (np.abs(state.tracks.x_a[0, 0] - plain[look.time].x) > 1e-3).any()
         if k >= delay:
             advised = plain[times[k - delay]]
-            advice = Advice(scenario.to_ns(times[k - delay]), np.zeros(1, np.int64), advised.x[None], advised.P[None])
+            given_ns, time_ns = scenario.to_ns(look.time), scenario.to_ns(times[k - delay])
+            advice = Advice(given_ns, time_ns, np.zeros(1, np.int64), advised.x[None], advised.P[None])
             state = tracker.advise(state, advice)

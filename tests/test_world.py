@@ -9,7 +9,8 @@ from scipy import stats
 
 from common.config import Scenario
 from common.errors import ConfigError
-from scenarios.world import _normal, scan_times_ns, simulate, simulate_all, truth
+from common.estimation.gaussian import draw_noise
+from scenarios.world import scan_times_ns, simulate, simulate_all, truth
 
 #: Probability that a statistical test fails though the code is right; seeds are fixed, so it fails always or never.
 ALPHA = 1e-3
@@ -150,7 +151,7 @@ def test_noise_is_digit_by_digit_that_of_numpy(n: int, count: int) -> None:
     A = np.random.default_rng(1).normal(size=(n, n))
     for P in (np.diag(np.arange(1.0, n + 1.0)), A @ A.T):
         expected = np.random.default_rng(2).multivariate_normal(np.zeros(n), P, size=count)
-        assert np.array_equal(_normal(np.random.default_rng(2), P, count), expected)
+        assert np.array_equal(draw_noise(np.random.default_rng(2), P, count), expected)
 
 
 def test_two_targets_of_one_hypothesis_are_drawn_apart() -> None:

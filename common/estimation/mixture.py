@@ -322,7 +322,9 @@ def _merged(branches: _Branches, label: IntArray, leader: IntArray, tracks: int)
         np.full((tracks, size), -np.inf),
         Gaussian(np.empty((filters, tracks, size, n)), np.empty((filters, tracks, size, n, n))),
     )
-    mixture.log_w[where], mixture.log_g[where] = log_w, total(a * (group.log_g - log_a))
+    # A share may underflow, and 0 times -inf is no zero.
+    evidence = np.where(a > 0.0, group.log_g, 0.0)
+    mixture.log_w[where], mixture.log_g[where] = log_w, total(a * (evidence - log_a))
     # Where there is no component any density does; that of the heaviest is one that a sensor can see.
     heaviest = np.flatnonzero(where[1] == 0)
     for array, values in zip(mixture.density, (reference[first] + mean, P), strict=True):

@@ -63,7 +63,9 @@ def multiply_mixtures(log_a: Array, terms: Whitened, keep: int = KEEP) -> Produc
     value = _log_integral(product)
     for mixture in sensors[1:]:
         pairs = [(a[:, :, None] + b[:, None]) for a, b in zip(product, mixture, strict=True)]
-        product = _Canonical(*(pair.reshape(len(pair), -1, *pair.shape[3:]) for pair in pairs))
+        product = _Canonical(
+            *(pair.reshape(len(pair), pair.shape[1] * pair.shape[2], *pair.shape[3:]) for pair in pairs)
+        )
         value = _log_integral(product)
         if value.shape[-1] > keep:
             total = log_sum_exp(value)

@@ -25,7 +25,20 @@ from stonesoup.types.state import GaussianState
 from stonesoup.types.track import Track
 from stonesoup.updater.probability import PDAUpdater
 
-from common.estimation.association import Clutter, Filtered, Plots, absorb, expect, gate_threshold, pdaf, update
+from common.estimation.association import (
+    Choice,
+    Clutter,
+    Filtered,
+    Plots,
+    absorb,
+    expect,
+    gate_threshold,
+    innovations,
+    kalman,
+    nearest,
+    pdaf,
+    update,
+)
 from common.estimation.gaussian import Array, Gaussian
 from common.estimation.motion import ConstantVelocity, predict
 from common.estimation.representation import Share
@@ -57,13 +70,18 @@ def clutter(p_d: float | Array, rho_f: float = 1e-3, p_g: float = 1.0) -> Clutte
 
 
 def tight(
-    factor: Gaussian, association: Gaussian, plots: Plots, sensors: tuple[Linearised, Linearised], clutter: Clutter
+    factor: Gaussian,
+    association: Gaussian,
+    plots: Plots,
+    sensors: tuple[Linearised, Linearised],
+    clutter: Clutter,
+    *choice: Choice,
 ) -> tuple[Filtered, Gaussian]:
     """The factor with its log p_bar (Eq. 13), and the association filter."""
     both = Gaussian(np.stack([factor.x, association.x]), np.stack([factor.P, association.P]))
     H = np.stack([np.broadcast_to(sensor.H, (*factor.x.shape[:-1], *sensor.H.shape[-2:])) for sensor in sensors])
     linear = Linearised(np.stack([sensor.z for sensor in sensors]), H, sensors[0].R)
-    (x, P), log_p_bar = update(expect(both, linear, clutter), plots)
+    (x, P), log_p_bar = update(expect(both, linear, clutter), plots, *choice)
     return Filtered(Gaussian(x[0], P[0]), log_p_bar), Gaussian(x[1], P[1])
 
 
@@ -474,3 +492,130 @@ def test_absorbing_no_plot_leaves_everything(draw: Draw) -> None:
     ours = absorb(expected, np.zeros((5, 3, 2)), np.tile([1.0, 0.0, 0.0, 0.0], (5, 1)))
     np.testing.assert_array_equal(ours.x, predicted.x)
     np.testing.assert_allclose(ours.P, predicted.P, rtol=1e-12)
+
+
+# Other choices --------------------------------------------------------------------------------------------------------
+
+
+def heaviest(log_p_star: list[float]) -> list[float]:
+    """Nearest neighbour: all weight on the heaviest hypothesis; if none is possible, on the missed detection."""
+    best = max(range(len(log_p_star)), key=lambda j: log_p_star[j])
+    return [float(j == best) for j in range(len(log_p_star))]
+
+
+def closest(log_p_star: list[float]) -> list[float]:
+    """Kalman with a gate: the missed detection only where no plot is in the gate."""
+    hits = [weight if j else -np.inf for j, weight in enumerate(log_p_star)]
+    return heaviest(hits if max(hits) > -np.inf else [0.0, *hits[1:]])
+
+
+CHOICES = pytest.mark.parametrize(("choice", "weights"), [(nearest, heaviest), (kalman, closest)], ids=["nn", "kf"])
+
+
+@CHOICES
+@pytest.mark.parametrize("p_g", [1.0, 0.9, 0.3])
+@pytest.mark.parametrize("p_d", [0.0, 0.3, 0.95, 1.0])
+@pytest.mark.parametrize("count", [0, 1, 6])
+def test_other_choices_equal_the_loop(
+    count: int, p_d: float, p_g: float, choice: Choice, weights: Callable[[list[float]], list[float]], draw: Draw
+) -> None:
+    """Two filters: the association filter chooses, the factor is filtered with its choice, Eq. (13) gives log p_bar."""
+    rng = np.random.default_rng([count, int(10 * p_d), int(10 * p_g)])
+    factors, associations = draw(rng, (12,), 4, 8.0), draw(rng, (12,), 4, 3.0)
+    zs, setting = rng.normal(0.0, 5.0, (count, 2)), clutter(np.full(12, p_d), 1e-3, p_g)
+    ours, after = tight(factors, associations, plots(zs), (seen_by(factors), seen_by(associations)), setting, choice)
+    for row in range(12):
+        one = clutter(p_d, 1e-3, p_g)
+        log_p_star = textbook_weights(associations.x[row], associations.P[row], zs, one)
+        q = weights(log_p_star)
+        possible = log_p_star[q.index(1.0)] > -np.inf
+        x, P, log_p_bar = textbook_tight(Gaussian(factors.x[row], factors.P[row]), q, zs, one)
+        density = Gaussian(ours.density.x[row], ours.density.P[row])
+        assert_same(Filtered(density, ours.log_p_bar[row]), x, P, log_p_bar if possible else -np.inf)
+        x, P = textbook_update(associations.x[row], associations.P[row], zs, q)
+        np.testing.assert_allclose(after.x[row], x, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(after.P[row], P, rtol=1e-9, atol=1e-9)
+
+
+def test_the_choices_differ(draw: Draw) -> None:
+    """A plot at the edge of the gate: nearest neighbour takes it for false, Kalman for the target's."""
+    predicted = Gaussian(np.zeros(4), np.diag([7.0, 12.0, 1.0, 1.0]))
+    z, both = np.array([[11.0, 0.0]]), Gaussian(np.zeros((1, 4)), np.diag([7.0, 12.0, 1.0, 1.0])[None])
+    expected = expect(both, seen_by(predicted)._replace(z=np.zeros((1, 2))), clutter(0.5, 1e-2, 0.9997))
+    chosen = {choice: update(expected, plots(z), choice) for choice in (nearest, kalman)}
+    np.testing.assert_array_equal(chosen[nearest].density.x[0], predicted.x)
+    assert chosen[nearest].log_p_bar == pytest.approx(np.log(1.0 - 0.5 * 0.9997))
+    np.testing.assert_allclose(chosen[kalman].density.x[0], [11.0 * 7.0 / 16.0, 0.0, 0.0, 0.0], atol=1e-12)
+
+
+# Plots that are not alike, plots that are angles ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("two", [False, True])
+def test_each_plot_is_weighed_with_the_density_of_false_plots_where_it_lies(*, two: bool, draw: Draw) -> None:
+    rng = np.random.default_rng(13)
+    wide, honest = draw(rng, (5,), 4, 6.0), draw(rng, (5,), 4, 3.0)
+    zs, relative = rng.normal(0.0, 5.0, (4, 2)), np.array([0.0, 2.0, -1.5, 0.7])
+    setting, scan = clutter(np.full(5, 0.6), 1e-3), Plots(zs, None, relative)
+    linear = seen_by(wide), seen_by(honest)
+    ours = tight(wide, honest, scan, linear, setting)[0] if two else pdaf(honest, scan, linear[1], setting)
+    for row in range(5):
+        log_p_star = textbook_weights(honest.x[row], honest.P[row], zs, clutter(0.6))
+        log_p_star = [log_p_star[0], *(weight - log for weight, log in zip(log_p_star[1:], relative, strict=True))]
+        total = float(logsumexp(log_p_star))
+        q = [float(np.exp(weight - total)) for weight in log_p_star]
+        if two:
+            x, P, log_p_bar = textbook_tight(Gaussian(wide.x[row], wide.P[row]), q, zs, clutter(0.6))
+            log_p_bar -= float(np.dot(q[1:], relative))
+        else:
+            (x, P), log_p_bar = textbook_update(honest.x[row], honest.P[row], zs, q), total
+        density = Gaussian(ours.density.x[row], ours.density.P[row])
+        assert_same(Filtered(density, ours.log_p_bar[row]), x, P, log_p_bar)
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_of_many_plots_each_keeps_its_density_of_false_plots(*, shared: bool, draw: Draw) -> None:
+    """So many that each track looks only at those it can reach."""
+    rng = np.random.default_rng(14)
+    tracks = draw(rng, (6,), 4, 3.0)
+    zs, relative = rng.uniform(-2000.0, 2000.0, (4000, 2)), rng.normal(0.0, 2.0, 4000)
+    zs[:40] = rng.normal(0.0, 6.0, (40, 2))
+    order = rng.permutation(4000)
+    zs, relative = zs[order], relative[order]
+    close = (np.abs(zs) < 100.0).all(axis=-1)
+    near = zs[close]
+    scan = Plots(zs, None, relative) if shared else Plots(zs[None], None, relative[None])
+    ours = pdaf(tracks, scan, seen_by(tracks), clutter(np.full(6, 0.6), 1e-3, 0.99))
+    for row in range(6):
+        setting = clutter(0.6, 1e-3, 0.99)
+        log_p_star = np.array(textbook_weights(tracks.x[row], tracks.P[row], near, setting)) - [0.0, *relative[close]]
+        log_p_bar = float(logsumexp(log_p_star))
+        x, P = textbook_update(tracks.x[row], tracks.P[row], near, [float(p) for p in np.exp(log_p_star - log_p_bar)])
+        density = Gaussian(ours.density.x[row], ours.density.P[row])
+        assert_same(Filtered(density, ours.log_p_bar[row]), x, P, log_p_bar)
+
+
+def test_angles_differ_around_the_circle() -> None:
+    z = np.array([[3.0, 3.1], [3.0, -3.1], [3.0, 7.0], [-4.0, np.pi]])
+    expected = np.array([1.0, -3.1])
+    straight, around = innovations(z, expected, ()), innovations(z, expected, (1,))
+    np.testing.assert_allclose(straight, z - expected)
+    np.testing.assert_allclose(around[:, 0], [2.0, 2.0, 2.0, -5.0])
+    np.testing.assert_allclose(around[:, 1], [6.2 - 2 * np.pi, 0.0, 10.1 - 4 * np.pi, np.pi + 3.1 - 2 * np.pi])
+    assert (np.abs(around[:, 1]) <= np.pi).all()
+    np.testing.assert_array_equal(z[0], [3.0, 3.1])
+
+
+@pytest.mark.parametrize("bearing", [np.pi - 0.01, -np.pi + 0.01, 0.3])
+def test_plots_on_both_sides_of_pi_are_near_each_other(bearing: float) -> None:
+    """Range and bearing: what is seen is the same wherever north lies."""
+    H, R = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]]), np.diag([100.0, 4e-4])
+    predicted = Gaussian(np.array([1000.0, bearing, 5.0, 0.0]), np.diag([400.0, 1e-4, 4.0, 1e-6]))
+    z = np.array([[1010.0, bearing + 0.02], [990.0, bearing - 0.02], [1000.0, bearing + 3.0]])
+    wrapped = np.stack([z[:, 0], np.remainder(z[:, 1] + np.pi, 2 * np.pi) - np.pi], axis=-1)
+    linear = Linearised(predicted.x[:2], H, R)
+    around = pdaf(predicted, Plots(wrapped), linear._replace(angular=(1,)), clutter(0.9, 1e-3, 0.999))
+    straight = pdaf(predicted, Plots(z), linear, clutter(0.9, 1e-3, 0.999))
+    assert_same(around, straight.density.x, straight.density.P, float(straight.log_p_bar))
+    if bearing != 0.3:
+        assert pdaf(predicted, Plots(wrapped), linear, clutter(0.9, 1e-3, 0.999)).log_p_bar < straight.log_p_bar - 0.1

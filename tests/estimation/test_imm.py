@@ -52,7 +52,7 @@ def clutter(p_d: float, rho_f: float = 1e-3, p_g: float = 1.0) -> Clutter:
 
 
 def scan(modes: Modes, z: Array, conditions: Clutter, sensor: Position) -> FilteredModes:
-    return imm_pdaf(modes, Plots(z), sensor.linearise(modes.densities.x, NOWHERE), conditions)
+    return imm_pdaf(modes, Plots(z), sensor.linearise(modes.densities, NOWHERE), conditions)
 
 
 def some_modes(draw: Draw, rng: np.random.Generator, shape: tuple[int, ...], imm: Imm, spread: float = 3.0) -> Modes:
@@ -192,7 +192,7 @@ def plain(
     sensor, total = Position((2.0, 3.0), model.n), 0.0
     for dt, zs in zip(dts, scans, strict=True):
         predicted = predict(prior, model.transition(dt), model.noise(dt))
-        filtered = pdaf(predicted, Plots(zs), sensor.linearise(predicted.x, NOWHERE), conditions)
+        filtered = pdaf(predicted, Plots(zs), sensor.linearise(predicted, NOWHERE), conditions)
         prior, total = filtered.density, total + float(filtered.log_p_bar)
     return prior, total
 
@@ -360,12 +360,12 @@ def test_a_batch_equals_the_loop(imm: Imm, shape: tuple[int, ...], draw: Draw) -
     valid = rng.random((*shape, 4)) < 0.7
     predicted = predict_modes(modes, imm, dt, 3.0)
     conditions = Clutter(np.asarray(rng.uniform(0.2, 0.9, shape)), np.full(shape, -7.0), 0.99)
-    filtered = imm_pdaf(predicted, Plots(z, valid), sensor.linearise(predicted.densities.x, NOWHERE), conditions)
+    filtered = imm_pdaf(predicted, Plots(z, valid), sensor.linearise(predicted.densities, NOWHERE), conditions)
     assert filtered.log_p_bar.shape == shape
     for row in np.ndindex(shape):
         one = Modes(modes.log_mu[row], Gaussian(modes.densities.x[row], modes.densities.P[row]))
         one = predict_modes(one, imm, np.array(dt[row]), 3.0)
-        linear = sensor.linearise(one.densities.x, NOWHERE)
+        linear = sensor.linearise(one.densities, NOWHERE)
         alone = Clutter(np.array(conditions.p_d[row]), np.array(-7.0), 0.99)
         expected = imm_pdaf(one, Plots(z[row][valid[row]]), linear, alone)
         np.testing.assert_allclose(filtered.modes.log_mu[row], expected.modes.log_mu, rtol=1e-10, atol=1e-11)

@@ -136,7 +136,7 @@ def filtered(imm: Imm, seen: World) -> tuple[Array, Array]:
     log_lr, squares = np.zeros(runs), []
     for k in range(seen.z.shape[1]):
         predicted = predict_modes(modes, imm, np.array(DT))
-        linear = sensor.linearise(predicted.densities.x, np.zeros(2))
+        linear = sensor.linearise(predicted.densities, np.zeros(2))
         modes, log_p_bar = imm_pdaf(predicted, Plots(seen.z[:, k], seen.valid[:, k]), linear, clutter)
         log_lr += log_p_bar
         squares.append(np.square(modes.merged.x[:, :2] - seen.paths[:, k, :2]).sum(axis=-1))

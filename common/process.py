@@ -37,6 +37,14 @@ def speed_factor(_: object, tokens: Sequence[Token]) -> float:
     return value
 
 
+def _seconds(_: object, value: float | None) -> None:
+    if value is not None and not 0.0 <= value < float("inf"):
+        raise ValueError(f"{value} is no number of seconds")
+
+
+#: Seconds, none or more.
+Seconds: TypeAlias = Annotated[float, Parameter(validator=_seconds)]
+
 #: Of a simulated world.
 Seed: TypeAlias = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 

@@ -14,10 +14,11 @@ from cyclopts import App, Parameter
 
 from benchmarks.cli import bench
 from common.config import Network, Scenario, load_scenario
+from common.errors import ConfigError
 from common.estimation.sprt import Status
 from common.logs import LogFormat, configure
 from common.messages import Tracks
-from common.process import HealthSocket, NetworkOptions, Seed, Speed
+from common.process import HealthSocket, NetworkOptions, Seconds, Seed, Speed
 from common.process import main as run_app
 from fusion_center.app import center
 from scenarios.catalogue import find, names
@@ -77,7 +78,11 @@ def run(
 
 @app.command
 def replay(
-    scenario: str, plots: Path | None = None, *, as_json: Annotated[bool, Parameter(name="--json", negative=())] = False
+    scenario: str,
+    plots: Path | None = None,
+    *,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    lag: Seconds | None = None,
 ) -> None:
     """Work through recorded plots in one process, deterministically and without a network.
 
@@ -85,13 +90,16 @@ def replay(
         scenario: scenario file, or name of one that comes along.
         plots: recorded plots (JSON Lines); default: the scenario's recording, or its simulated world.
         as_json: print one JSON line per track and measurement time, and nothing else.
+        lag: with --json, say in each line also where the track was so many seconds ago, with everything known now.
     """
     from sensor_node.sources import all_scans
     from studies.lines import TrackLines
     from studies.replay import Replay
 
+    if lag is not None and not as_json:
+        raise ConfigError("--lag: the states of tracks are in JSON lines only: give --json too")
     loaded = load_scenario(find(scenario))
-    lines = TrackLines(loaded)
+    lines = TrackLines(loaded, lag)
     final: dict[int, str] = {}
     for message in Replay(loaded, all_scans(loaded, plots=plots)).run():
         if isinstance(message, Tracks) and as_json:

@@ -11,6 +11,7 @@ import numpy as np
 from common.config import Scenario
 from common.estimation.sprt import Status
 from common.messages import Decision, Tracks
+from fusion_center.lag import FixedLag, Past
 
 _LARGEST = float(np.finfo(np.float64).max)
 
@@ -18,15 +19,29 @@ _LARGEST = float(np.finfo(np.float64).max)
 class TrackLines:
     """Turns pictures into lines: every track after every measurement time, deleted ones as they were at the end."""
 
-    def __init__(self, scenario: Scenario) -> None:
-        """For times in seconds since the scenario's epoch."""
+    def __init__(self, scenario: Scenario, lag_s: float | None = None) -> None:
+        """For times in seconds since the scenario's epoch.
+
+        Args:
+            scenario: the network.
+            lag_s: say also where the tracks were so many seconds ago, with everything known now.
+        """
         self._scenario = scenario
+        self._lag = None if lag_s is None else FixedLag.of(scenario, lag_s)
+        self._past: Past = ()
         self._deleted: dict[int, dict[str, Any]] = {}
 
     def of(self, tracks: Tracks) -> Iterator[str]:
         """The lines of one measurement time, by track."""
         time_s = self._scenario.to_seconds(tracks.time_ns)
         entries = {int(track): _entry(tracks, row) for row, track in enumerate(tracks.ids)}
+        if self._lag is not None:
+            self._past, lagged = self._lag.step(self._past, tracks)
+            for entry in entries.values():
+                entry.update(time_lag=None, x_lag=None, P_lag=None)
+            then_s = self._scenario.to_seconds(lagged.time_ns)
+            for track, x, P in zip(lagged.ids, lagged.x, lagged.P, strict=True):
+                entries[int(track)].update(time_lag=then_s, x_lag=x.tolist(), P_lag=P.tolist())
         for track, entry in sorted({**self._deleted, **entries}.items()):
             if entry["status"] == "deleted":
                 self._deleted[track] = entry

@@ -65,9 +65,12 @@ def test_first_steps_of_the_readme(folder: Path) -> None:
 @pytest.mark.processes
 def test_how_to_on_one_machine(folder: Path) -> None:
     steps = [words for title in ("1.", "2.", "3.") for words in commands(section(HOW_TO, title))]
-    assert len(steps) == 4
-    *_, lines = [run(words, folder) for words in steps]
+    assert len(steps) == 5
+    *_, lines, lagged = [run(words, folder) for words in steps]
     last = {line["track"]: line["status"] for line in map(json.loads, lines.splitlines())}
+    then = [line["time_lag"] for line in map(json.loads, lagged.splitlines()) if line["track"] == 0]
+    assert then[:8] == 8 * [None]
+    assert then[8] == 0.5
     assert last == {0: "confirmed", 1: "deleted"}
     decisions = json.loads((folder / "harbour-run/decisions.json").read_text())
     assert {track["track"]: track["status"] for track in decisions["tracks"]} == last

@@ -54,6 +54,23 @@ class Reduction(NamedTuple):
 EXACT = Reduction(components=2**31, prune=0.0, combine=0.0)
 
 
+class Ancestry(NamedTuple):
+    """Where the components of mixtures come from: a row for every branch that lives on, those of a component together.
+
+    Attributes:
+        track, component: numbers of the new component, shape (N,), ascending.
+        parent: number of the component that it comes from, shape (N,).
+        plot: number of its plot in the scan, -1: missed, shape (N,).
+        log_share: logarithms of its share a in the component (Eq. 17), 0 where nothing was combined, shape (N,).
+    """
+
+    track: IntArray
+    component: IntArray
+    parent: IntArray
+    plot: IntArray
+    log_share: Array
+
+
 class _Branches(NamedTuple):
     """Histories, in flat arrays: those of a track together, the heaviest first.
 
@@ -95,7 +112,31 @@ def step(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction)
     References:
         theory.md Eq. (15), (17); W. Koch, Tracking and sensor data fusion (2014), §3.3.
     """
-    return _chosen(prior, _missed(prior, expected), _hit(prior, expected, plots), reduction)
+    near = within_reach(expected, plots)
+    hit = _hit(prior, expected, near, _hits(prior, expected, near))
+    return _chosen(prior, _missed(prior, expected), hit, reduction)
+
+
+def step_traced(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction) -> tuple[Mixture, Ancestry]:
+    """``step``, and where the components come from."""
+    tracks = len(prior.log_w)
+    hits = _hits(prior, expected, plots)
+    branches = _joined(prior, _missed(prior, expected), _hit(prior, expected, plots, hits))
+    rows = _survivors(branches, reduction.prune, tracks)
+    branches = take(branches, rows)
+    label, leader = _groups(branches, tracks, reduction)
+    _, missed = np.nonzero(prior.log_w > -np.inf)
+    parent = np.concatenate((missed, hits[1]))[rows]
+    plot = np.concatenate((np.full(len(missed), -1), hits[2]))[rows]
+    order = np.lexsort((label, branches.track))
+    order = order[label[order] >= 0]
+    slot = branches.track[order] * (label.max(initial=0) + 1) + label[order]
+    first = np.flatnonzero(np.diff(slot, prepend=-1))
+    log_w = branches.log_w[order]
+    total = np.logaddexp.reduceat(log_w, first)
+    log_share = log_w - np.repeat(total, np.diff(first, append=len(slot)))
+    ancestry = Ancestry(branches.track[order], label[order], parent[order], plot[order], log_share)
+    return _merged(branches, label, leader, tracks), ancestry
 
 
 def step_with(prior: Mixture, log_p_star: Array, density: Gaussian, reduction: Reduction) -> Mixture:
@@ -127,7 +168,13 @@ def step_with(prior: Mixture, log_p_star: Array, density: Gaussian, reduction: R
 
 
 def _chosen(prior: Mixture, missed: _Branches, hit: _Branches, reduction: Reduction) -> Mixture:
-    """The mixture of all branches, reduced; there is a missed one for every component that lives."""
+    """The mixture of all branches, reduced."""
+    branches = _joined(prior, missed, hit)
+    return _combined(_pruned(branches, reduction.prune, len(prior.log_w)), len(prior.log_w), reduction)
+
+
+def _joined(prior: Mixture, missed: _Branches, hit: _Branches) -> _Branches:
+    """All branches; there is a missed one for every component that lives."""
     branches = _Branches(*(np.concatenate(pair) for pair in zip(missed, hit, strict=True)))
     # Where h1 holds the scan for impossible (p_d = 1 and no plot in the gate), nothing can be learnt from it.
     best = np.full(len(prior.log_w), -np.inf)
@@ -135,7 +182,7 @@ def _chosen(prior: Mixture, missed: _Branches, hit: _Branches, reduction: Reduct
     if (lost := best == -np.inf).any():
         rows = lost[branches.track[: len(missed.track)]]
         branches.log_w[: len(rows)][rows] = prior.log_w[prior.log_w > -np.inf][rows]
-    return _combined(_pruned(branches, reduction.prune, len(best)), len(best), reduction)
+    return branches
 
 
 def reduced(mixture: Mixture, reduction: Reduction) -> Mixture:
@@ -159,17 +206,22 @@ def _missed(prior: Mixture, expected: Expected) -> _Branches:
     return _Branches(alive[0], prior.log_w[alive] + log_miss, prior.log_g[alive] + log_miss, x, P)
 
 
-def _hit(prior: Mixture, expected: Expected, plots: Plots) -> _Branches:
-    """The branches with a plot, one for every component that lives and every plot in its gate."""
-    near = within_reach(expected, plots)
+def _hits(prior: Mixture, expected: Expected, near: Plots) -> tuple[IntArray, ...]:
+    """Numbers of track, component and plot, for every component that lives and every plot in its gate."""
     nu = innovations(near.z, expected.z[-1, :, :, None], expected.angular)
     distance = squared_norm(np.matvec(expected.whitener[-1, :, :, None], nu))
     inside = (distance <= expected.gate) & (prior.log_w > -np.inf)[..., None]
     if near.valid is not None:
         inside &= near.valid
-    track, component, _ = np.nonzero(inside)
+    return np.nonzero(inside)
+
+
+def _hit(prior: Mixture, expected: Expected, near: Plots, hits: tuple[IntArray, ...]) -> _Branches:
+    """The branches with a plot."""
+    track, component, _ = hits
+    pairs = (*prior.log_w.shape, near.z.shape[-2])
     # All filters of all branches, the branches first: shapes (N, F, ...).
-    z = np.broadcast_to(near.z, (*inside.shape, nu.shape[-1]))[inside]
+    z = np.broadcast_to(near.z, (*pairs, near.z.shape[-1]))[hits]
     white, peak, mean, W, P, x = (
         np.ascontiguousarray(np.moveaxis(array[:, track, component], 1, 0))
         for array in (expected.whitener, expected.log_peak, expected.z, expected.W, expected.P_hit, expected.density.x)
@@ -177,22 +229,33 @@ def _hit(prior: Mixture, expected: Expected, plots: Plots) -> _Branches:
     w = np.matvec(white, innovations(z[:, None], mean, expected.angular))
     log_p = peak - 0.5 * squared_norm(w) + np.broadcast_to(expected.log_hit, prior.log_w.shape)[track, component, None]
     if near.log_relative is not None:
-        log_p -= np.broadcast_to(near.log_relative, inside.shape)[inside][:, None]
+        log_p -= np.broadcast_to(near.log_relative, pairs)[hits][:, None]
     log_w, log_g = prior.log_w[track, component] + log_p[:, -1], prior.log_g[track, component] + log_p[:, 0]
     return _Branches(track, log_w, log_g, x + np.matvec(W, w), P)
 
 
 def _pruned(branches: _Branches, share: float, tracks: int) -> _Branches:
-    """Without the branches lighter than a share of their track's heaviest, those of a track by weight."""
+    """The survivors."""
+    return take(branches, _survivors(branches, share, tracks))
+
+
+def _survivors(branches: _Branches, share: float, tracks: int) -> IntArray:
+    """The branches that are not lighter than a share of their track's heaviest, those of a track by weight."""
     order = np.lexsort((-branches.log_w, branches.track))
     track, log_w = branches.track[order], branches.log_w[order]
     first = np.searchsorted(track, np.arange(tracks))
     limit = np.log(share) if share > 0.0 else -np.inf
     kept = (log_w >= log_w[first[track]] + limit) & (log_w > -np.inf)
-    return take(branches, order[kept])
+    rows: IntArray = order[kept]
+    return rows
 
 
 def _combined(branches: _Branches, tracks: int, reduction: Reduction) -> Mixture:
+    """Mixtures of the branches, combined."""
+    return _merged(branches, *_groups(branches, tracks, reduction), tracks)
+
+
+def _groups(branches: _Branches, tracks: int, reduction: Reduction) -> tuple[IntArray, IntArray]:
     """Local combining: branches around the heaviest become one component, then around the next heaviest, ... ."""
     track = branches.track
     label = np.full(len(track), -1)
@@ -219,7 +282,7 @@ def _combined(branches: _Branches, tracks: int, reduction: Reduction) -> Mixture
             ends = np.flatnonzero(label == reduction.components - 1)
             last[track[ends][::-1]] = leader[ends][::-1]
             leader[left] = last[track[left]]
-    return _merged(branches, label, leader, tracks)
+    return label, leader
 
 
 def _merged(branches: _Branches, label: IntArray, leader: IntArray, tracks: int) -> Mixture:

@@ -31,7 +31,7 @@ from common.estimation.sensing import Position, Sensor
 from common.estimation.sprt import thresholds
 from common.messages import NEVER, Report
 from common.quantities import NS_PER_S
-from fusion_center.picture import Fuser, Heard
+from fusion_center.factors import Fuser, Heard
 
 PACKAGES = ("numpy", "scipy", "stonesoup")
 BATCHES = (1, 10, 100, 1000)

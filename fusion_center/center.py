@@ -34,7 +34,8 @@ from common.messages import (
     Tracks,
 )
 from common.quantities import NS_PER_S
-from fusion_center.picture import Fuser, Picture
+from fusion_center.factors import Fuser
+from fusion_center.picture import Picture
 from fusion_center.selected import SelectedFuser
 from fusion_center.state import (
     AnyExpected,

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from common.estimation.gaussian import Gaussian
 from common.messages import NEVER, Clock, Decision, IntArray, Join, Picked, Rebase, Report
-from fusion_center.picture import Backup, Expected, Heard, Picture
+from fusion_center.factors import Expected, Heard
+from fusion_center.picture import Backup, Picture
 from fusion_center.selected import ExpectedTracks, HeardPlots
 
 

@@ -25,7 +25,7 @@ DISTRIBUTED = {name: mode for name, mode in MODES.items() if "fusion" not in nam
 DISTRIBUTED = {name: mode for name, mode in DISTRIBUTED.items() if not name.startswith("centralised")}
 
 
-SAME = {"decentralised-decisions", "selected-plots-float32"}
+SAME = {"decentralised-decisions", "selected-plots", "selected-plots-float32"}
 
 
 def world(*sensors: dict[str, Any], **tables: Any) -> Scenario:
@@ -98,6 +98,14 @@ def test_modes_differ() -> None:
     for i, one in enumerate(names):
         for other in names[:i]:
             assert (np.abs(last[one] - last[other]) > 1e-6).any(), (one, other)
+
+
+def test_selected_plots_decide_as_all_plots_where_none_that_matters_is_missing() -> None:
+    plot = world()
+    worlds = draw(plot, SEEDS)
+    selected, everything = (play(plot, name, worlds) for name in ("selected-plots", "centralised-mht"))
+    np.testing.assert_allclose(selected.log_lr, everything.log_lr, rtol=1e-9, atol=1e-9)
+    assert selected.uplink_bytes < everything.uplink_bytes
 
 
 @pytest.mark.parametrize("name", DISTRIBUTED)

@@ -1,0 +1,374 @@
+"""How the reports of one measurement time move a picture of factors (Eq. 9-11, 18)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from common.config import Scenario
+from common.estimation.batch import concatenate, put, take
+from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, log_sum_exp, moments, whitener
+from common.estimation.imm import Imm, Modes, predict_modes
+from common.estimation.mixture_product import multiply_mixtures
+from common.estimation.motion import Motion
+from common.estimation.ratio import log_lambda
+from common.estimation.representation import Share, globalise, shrink
+from common.estimation.sensing import Sensor
+from common.estimation.sprt import DELETED, TENTATIVE, Thresholds
+from common.messages import Decision, IntArray, Picked, Rebase, Report
+from common.quantities import NS_PER_S
+from fusion_center.picture import Backup, Picture, common, decided
+
+#: No position or speed in m, m/s is larger, and no standard deviation smaller than its inverse.
+_LARGEST = 1e15
+
+
+class Heard(NamedTuple):
+    """A report, its factors taken apart when it came.
+
+    Attributes:
+        report: as it came.
+        log_p_bar: of all terms of a track, shape (T,).
+        log_a: relative weights of the terms, shape (T, K).
+        P: of the terms, shape (T, K, n, n).
+        factors: the terms, shapes (T, K, n), (T, K, n, n), (T, K).
+        lineage: epoch of the rebase that they descend from; 0: none.
+    """
+
+    report: Report
+    log_p_bar: Array
+    log_a: Array
+    P: Array
+    factors: Whitened
+    lineage: int = 0
+
+    @classmethod
+    def of(cls, report: Report) -> Heard:
+        """Take a report apart.
+
+        Raises:
+            numpy.linalg.LinAlgError: when a covariance is not positive definite.
+        """
+        factors = Whitened(report.x, *whitener(report.P))
+        if len(report.log_g) == len(report.ids):  # one term each
+            log_a = np.zeros((len(report.ids), 1))
+            return cls(report, report.log_g, log_a, report.P[:, None], Whitened(*(part[:, None] for part in factors)))
+        # Where a track has fewer terms than others its first one stands there with no weight.
+        size = int(report.terms.max(initial=1))
+        there = np.arange(size) < report.terms[:, None]
+        first = np.cumsum(report.terms) - report.terms
+        which = np.where(there, first[:, None] + np.arange(size), first[:, None])
+        log_g = np.where(there, report.log_g[which], -np.inf)
+        log_p_bar = log_sum_exp(log_g)
+        possible = (log_p_bar > -np.inf)[:, None]
+        log_a = np.where(possible, log_g, np.where(there, 0.0, -np.inf)) - np.where(possible, log_p_bar[:, None], 0.0)
+        log_a -= log_sum_exp(log_a)[:, None]
+        return cls(report, log_p_bar, log_a, report.P[which], Whitened(*(part[which] for part in factors)))
+
+
+class Expected(NamedTuple):
+    """A picture at its next measurement time: all that does not depend on what will be reported.
+
+    Attributes:
+        picture: that it was worked out from.
+        t_ns: the measurement time.
+        kept: the tracks that had not been deleted.
+        live: which of them started before.
+        moving: those.
+        log_a, factors: those, predicted.
+        whitened: the same, taken apart.
+        product: of the predicted factors.
+        network_P: for ``dkf``, the covariances that all factors have by the models alone, predicted.
+    """
+
+    picture: Picture
+    t_ns: int
+    kept: Picture
+    live: BoolArray
+    moving: Picture
+    log_a: Array
+    factors: Gaussian
+    whitened: Whitened
+    product: Product
+    network_P: Array
+
+
+class Reported(NamedTuple):
+    """What the reports of one measurement time say about the tracks of a picture.
+
+    Attributes:
+        who: which sensors reported which track, shape (T, S).
+        log_p_bar: cumulative, shape (T, S); where nothing was reported, the last one.
+        log_a: relative weights of the terms, shape (T, S, K); where nothing was reported, the last ones.
+        P: of the factors, shape (T, S, K, n, n); where nothing was reported, of the predicted ones.
+        factors: the same, taken apart.
+    """
+
+    who: BoolArray
+    log_p_bar: Array
+    log_a: Array
+    P: Array
+    factors: Whitened
+
+
+@dataclass(frozen=True)
+class Fuser:
+    """The steps of the picture.
+
+    Attributes:
+        motion: motion model.
+        sensors: models of the sensors, in the order of the scenario.
+        share: a sensor's share of prior and process noise.
+        terms: most terms of a factor.
+        limits: thresholds of the test, or None: nothing is decided.
+        globalised: predict as ``dkf`` does.
+    """
+
+    motion: Motion
+    sensors: tuple[Sensor, ...]
+    share: Share
+    terms: int
+    limits: Thresholds | None
+    globalised: bool
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Fuser:
+        """The fuser of a scenario."""
+        motion = scenario.motion.build()
+        return cls(
+            motion=motion,
+            sensors=tuple(sensor.build(motion) for sensor in scenario.sensors),
+            share=scenario.share,
+            terms=len(motion.models) if isinstance(motion, Imm) else scenario.fusion.terms,
+            limits=scenario.decision.thresholds if scenario.decision.enabled else None,
+            globalised=scenario.fusion.mode == "dkf",
+        )
+
+    def empty(self) -> Picture:
+        """A picture without tracks."""
+        n, n_sensors = self.motion.n, len(self.sensors)
+        ints, floats = np.empty(0, np.int64), np.empty(0)
+        per_sensor = np.empty((0, n_sensors))
+        return Picture(
+            ids=ints,
+            starts_ns=ints,
+            x0=np.empty((0, n)),
+            P0=np.empty((0, n, n)),
+            times_ns=ints,
+            status=np.empty(0, np.uint8),
+            scans=ints,
+            log_lr=floats,
+            log_lr_total=floats,
+            log_p_bar=per_sensor,
+            log_a=np.empty((0, n_sensors, self.terms)),
+            reported=per_sensor.astype(np.bool_),
+            contributing=per_sensor.astype(np.bool_),
+            x=np.empty((0, n_sensors, self.terms, n)),
+            P=np.empty((0, n_sensors, self.terms, n, n)),
+            fused_x=np.empty((0, n)),
+            fused_P=np.empty((0, n, n)),
+            network_P=np.empty((0, n_sensors if self.globalised else 0, n, n)),
+        )
+
+    def heard(self, report: Report | Picked) -> Heard | None:
+        """A report taken apart, if it can be computed with."""
+        if not isinstance(report, Report) or report.x.shape[-1] != self.motion.n or (report.terms > self.terms).any():
+            return None
+        # Positive definite, and far from where squares overflow.
+        variances = report.P.diagonal(axis1=-2, axis2=-1)
+        if (np.abs(report.x) > _LARGEST).any() or (variances > _LARGEST**2).any() or (variances < _LARGEST**-2).any():
+            return None
+        try:
+            return Heard.of(report)
+        except np.linalg.LinAlgError:
+            return None
+
+    def backup(self, picture: Picture, number: int) -> Backup:
+        """What a sensor that joins goes on from: its last factor where it reported one, else the prior.
+
+        A report is the whole state of a factor, so the center is every node's backup.
+        """
+        held = picture.reported[:, number]
+        prior = self.share.start(Gaussian(picture.x0, picture.P0))
+        # Which of its hypotheses a node held for true it has not said: the terms' own weights must do.
+        last = moments(np.exp(picture.log_a[:, number]), Gaussian(picture.x[:, number], picture.P[:, number]))
+        return Backup(
+            times_ns=np.where(held, picture.times_ns, picture.starts_ns),
+            log_p_bar=picture.log_p_bar[:, number],
+            x=np.where(held[:, None], last.x, prior.x),
+            P=np.where(held[:, None, None], last.P, prior.P),
+            x_a=np.where(held[:, None], picture.fused_x, picture.x0),
+            P_a=np.where(held[:, None, None], picture.fused_P, picture.P0),
+        )
+
+    def begin(self, picture: Picture, ids: IntArray, times_ns: IntArray, priors: Gaussian) -> Picture:
+        """Add tracks that start with ``priors``, shapes (T, n), (T, n, n)."""
+        tracks, n_sensors = len(ids), len(self.sensors)
+        log_a, (x, P) = self._shares(priors)
+        new = Picture(
+            ids=ids,
+            starts_ns=times_ns,
+            x0=priors.x,
+            P0=priors.P,
+            times_ns=times_ns,
+            status=np.full(tracks, TENTATIVE, np.uint8),
+            scans=np.zeros(tracks, np.int64),
+            log_lr=np.zeros(tracks),
+            log_lr_total=np.zeros(tracks),
+            log_p_bar=np.zeros((tracks, n_sensors)),
+            log_a=log_a,
+            reported=np.zeros((tracks, n_sensors), np.bool_),
+            contributing=np.zeros((tracks, n_sensors), np.bool_),
+            x=x,
+            P=P,
+            fused_x=priors.x,
+            fused_P=priors.P,
+            network_P=P[:, :, 0] if self.globalised else P[:, :0, 0],
+        )
+        both = concatenate(picture, new)
+        return take(both, np.argsort(both.ids))
+
+    def rebased(self, now: Picture, then: Picture, told: Rebase) -> Picture:
+        """The newest picture with factors that begin anew from what the nodes were told (theory.md §3).
+
+        The density and LR at that time stay what they were; what was reported since comes again, with the new factors.
+
+        Args:
+            now: the newest picture.
+            then: the picture at the time of the rebase.
+            told: the fused tracks.
+
+        Returns:
+            the picture, its rebased tracks at the time of the rebase.
+        """
+        rows, given = common(now.ids, told.ids)
+        old, _ = common(then.ids, now.ids[rows])
+        assert len(then.ids[old]) == len(now.ids[rows]), "a track that was told of was there"
+        log_a, (x, P) = self._shares(Gaussian(told.x[given], told.P[given]))
+        part = take(now, rows) if not isinstance(rows, slice) else now
+        total, possible = then.log_lr_total[old], part.log_lr_total > -np.inf
+        # What confirmations took from log LR since stays taken.
+        taken = np.subtract(part.log_lr_total, part.log_lr, out=np.zeros_like(total), where=possible)
+        part = part._replace(
+            times_ns=np.full_like(part.times_ns, told.time_ns),
+            log_lr=np.where(possible, total - taken, then.log_lr[old]),
+            log_lr_total=total,
+            log_p_bar=np.zeros_like(part.log_p_bar),
+            log_a=log_a,
+            reported=np.ones_like(part.reported),
+            x=x,
+            P=P,
+            fused_x=told.x[given],
+            fused_P=told.P[given],
+        )
+        return part if isinstance(rows, slice) else put(now, rows, part)
+
+    def _shares(self, densities: Gaussian) -> tuple[Array, Gaussian]:
+        """Weights and densities of the terms of all factors whose product is given, shapes (T, S, K), ... ."""
+        n_sensors, factor = len(self.sensors), self.share.start(densities)
+        log_a = np.full((len(factor.x), n_sensors, self.terms), -np.inf)
+        log_a[:, :, 0] = 0.0
+        if isinstance(self.motion, Imm):
+            log_a[:] = -np.log(self.terms)
+        x, P = (np.repeat(np.repeat(part[:, None, None], n_sensors, axis=1), self.terms, axis=2) for part in factor)
+        return log_a, Gaussian(x, P)
+
+    def expect(self, picture: Picture, t_ns: int) -> Expected:
+        """Work out what a picture will be at a measurement time, as far as no report is needed for it."""
+        kept = take(picture, picture.status != DELETED)
+        live = kept.times_ns < t_ns
+        moving = take(kept, live)
+        log_a, factors, network_P = self._predict(moving, t_ns)
+        whitened = Whitened(factors.x, *whitener(factors.P))
+        product = multiply_mixtures(log_a, whitened)
+        return Expected(picture, t_ns, kept, live, moving, log_a, factors, whitened, product, network_P)
+
+    def advance(self, expected: Expected, reports: Mapping[int, Heard]) -> tuple[Picture, list[Decision]]:
+        """Work in all reports of one measurement time.
+
+        A sensor that is silent, or does not report a track, keeps its factor there, predicted, with p_bar = 1.
+
+        Args:
+            expected: the picture, predicted to the measurement time.
+            reports: by number of the sensor.
+
+        Returns:
+            the picture at the measurement time and what was decided.
+        """
+        moved = self._move(expected, reports)
+        moved, decisions = decided(moved, self.limits)
+        return (moved if expected.live.all() else put(expected.kept, expected.live, moved)), decisions
+
+    def _move(self, expected: Expected, reports: Mapping[int, Heard]) -> Picture:
+        picture, before = expected.moving, expected.product
+        said = _collect(expected, reports)
+        heard = said.who.any(axis=-1)
+        after = multiply_mixtures(said.log_a, said.factors) if heard.any() else before
+        # Cumulative sums that are both -inf have not changed.
+        same = said.log_p_bar == picture.log_p_bar
+        evidence = np.where(same, 0.0, said.log_p_bar) - np.where(same, 0.0, picture.log_p_bar)
+        # A track that nobody reported stays as it is, to the last digit.
+        step = np.where(heard, log_lambda(before, after, evidence), 0.0)
+        network_P = self._shrunk(expected.network_P, reports) if self.globalised else expected.network_P
+        return picture._replace(
+            times_ns=np.full_like(picture.times_ns, expected.t_ns),
+            scans=picture.scans + heard,
+            log_lr=picture.log_lr + step,
+            log_lr_total=picture.log_lr_total + step,
+            log_p_bar=said.log_p_bar,
+            log_a=said.log_a,
+            reported=picture.reported | said.who,
+            contributing=said.who,
+            x=said.factors.x,
+            P=said.P,
+            fused_x=after.density.x,
+            fused_P=after.density.P,
+            network_P=network_P,
+        )
+
+    def _predict(self, picture: Picture, t_ns: int) -> tuple[Array, Gaussian, Array]:
+        """Predict all factors and the weights of their terms as their nodes do (Eq. 5)."""
+        dt: Array = (t_ns - picture.times_ns) / NS_PER_S
+        dt = dt[0, ...] if len(dt) and (dt == dt[0]).all() else dt[:, None, None]
+        factors = Gaussian(picture.x, picture.P)
+        if isinstance(self.motion, Imm):
+            dt = dt[..., 0] if dt.ndim else dt
+            modes = predict_modes(Modes(picture.log_a, factors), self.motion, dt, self.share.multiplicity)
+            return modes.log_mu, modes.densities, picture.network_P
+        if not self.globalised:
+            return picture.log_a, self.share.predict(factors, self.motion, dt), picture.network_P
+        common = globalise(picture.network_P)
+        P = np.repeat(common.P[:, None, None], len(self.sensors), axis=1)
+        x = np.matvec(common.G, factors.x[:, :, 0])[:, :, None]
+        predicted = self.share.predict(Gaussian(x, P), self.motion, dt)
+        return picture.log_a, predicted, predicted.P[:, :, 0]
+
+    def _shrunk(self, network_P: Array, reports: Mapping[int, Heard]) -> Array:
+        network_P = network_P.copy()
+        for number in reports:
+            P = network_P[:, number]
+            linear = self.sensors[number].measurement.linearise(
+                Gaussian(np.zeros(P.shape[:-1]), P), np.zeros(self.motion.dimensions)
+            )
+            network_P[:, number] = shrink(P, linear.H, linear.R)
+        return network_P
+
+
+def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
+    """Lay the reports over the predicted factors; tracks that a report or the picture lacks are left alone."""
+    picture = expected.moving
+    who, log_p_bar, log_a = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy(), expected.log_a.copy()
+    P, factors = expected.factors.P.copy(), Whitened(*(array.copy() for array in expected.whitened))
+    for number, heard in reports.items():
+        rows, others = common(picture.ids, heard.report.ids)
+        who[rows, number] = True
+        log_p_bar[rows, number] = heard.log_p_bar[others]
+        size = heard.log_a.shape[1]
+        log_a[rows, number, :size], log_a[rows, number, size:] = heard.log_a[others], -np.inf
+        P[rows, number, :size] = heard.P[others]
+        for array, new in zip(factors, heard.factors, strict=True):
+            array[rows, number, :size] = new[others]
+    return Reported(who, log_p_bar, log_a, P, factors)

@@ -141,10 +141,8 @@ def merged(histories: Sequence[History]) -> History:
     log_w = [history.log_w for history in histories]
     total = float(logsumexp(log_w))
     log_g = sum(float(np.exp(h.log_w - total)) * (h.log_g - (h.log_w - total)) for h in histories)
-    honest, factor = (
-        mean_of(log_w, [density(history) for history in histories])
-        for density in (lambda history: history.honest, lambda history: history.factor)
-    )
+    honest = mean_of(log_w, [history.honest for history in histories])
+    factor = mean_of(log_w, [history.factor for history in histories])
     return History(total, log_g, honest, factor)
 
 

@@ -205,7 +205,7 @@ def test_a_sensor_that_starts_anew_gets_its_factor_back_as_moments() -> None:
     for track in range(2):
         own = slice(3 * track, 3 * track + 3)
         moments = mean_of(
-            report.log_g[own], [Density(*term) for term in zip(report.x[own], report.P[own], strict=True)]
+            report.log_g[own].tolist(), [Density(*term) for term in zip(report.x[own], report.P[own], strict=True)]
         )
         np.testing.assert_allclose(back.x[track], moments.x, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(back.P[track], moments.P, rtol=1e-9, atol=1e-6)

@@ -82,7 +82,7 @@ def component(mixture: Mixture, track: int, number: int) -> History:
 
 def components(mixture: Mixture, track: int) -> list[History]:
     """Those that there are, the heaviest first."""
-    there = [component(mixture, track, i) for i in np.flatnonzero(mixture.log_w[track] > -np.inf)]
+    there = [component(mixture, track, int(i)) for i in np.flatnonzero(mixture.log_w[track] > -np.inf)]
     return sorted(there, key=lambda history: -history.log_w)
 
 
@@ -163,8 +163,10 @@ def test_a_generous_multi_hypothesis_tracker_is_nearly_exact(draw: Draw) -> None
     for track in range(3):
         exact, ours = histories(prior, track, scans), components(mixture, track)
         assert logsumexp([h.log_g for h in ours]) == pytest.approx(logsumexp([h.log_g for h in exact]), abs=1e-6)
-        for density in (lambda history: history.honest, lambda history: history.factor):
-            one, other = (mean_of([h.log_w for h in every], [density(h) for h in every]) for every in (ours, exact))
+        for field in ("honest", "factor"):
+            one, other = (
+                mean_of([h.log_w for h in every], [getattr(h, field) for h in every]) for every in (ours, exact)
+            )
             np.testing.assert_allclose(one.x, other.x, rtol=1e-6, atol=1e-6)
             np.testing.assert_allclose(one.P, other.P, rtol=1e-6, atol=1e-6 * np.abs(other.P).max())
 
@@ -349,7 +351,8 @@ def pruned(every: list[History], share: float) -> list[History]:
 
 def locally_combined(every: list[History], nearer: float, most: int) -> list[History]:
     """theory.md §9: around the heaviest, then around the next heaviest that is left; the last takes all others."""
-    left, result = list(every), []
+    left = list(every)
+    result: list[History] = []
     while left:
         first = left[0].honest
 

@@ -17,7 +17,7 @@ from benchmarks.worlds import World
 from common.config import Network
 from common.inbox import Inbox
 from common.logs import configure
-from common.messages import Message, Report, Scan, Tracks
+from common.messages import Message, Picked, Report, Scan, Tracks
 from common.process import stopped_by_signals
 from common.transport import open_zenoh
 from fusion_center.center import Center
@@ -39,7 +39,7 @@ class TimedNode(NodeShell):
 
     def _publish(self, message: Message) -> bool:
         sent = super()._publish(message)
-        if isinstance(message, Report):
+        if isinstance(message, Report | Picked):
             self.stamps.append((message.time_ns, self._began_at, time.monotonic_ns()))
         return sent
 
@@ -52,7 +52,7 @@ class TimedCenter(CenterShell):
     arrivals: deque[int]
 
     def _step(self, event: Event) -> None:
-        if isinstance(event, Report):
+        if isinstance(event, Report | Picked):
             at = self.arrivals.popleft()
             self.came[event.time_ns] = max(at, self.came.get(event.time_ns, 0))
         super()._step(event)

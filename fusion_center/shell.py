@@ -12,7 +12,7 @@ from common.errors import DecodeError
 from common.health import Health, age_s
 from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
-from common.messages import NEVER, Decision, Join, Keys, Message, Report, Tracks, sensor_of
+from common.messages import NEVER, Decision, Join, Keys, Message, Picked, Report, Tracks, sensor_of
 from common.transport import Bus, Publisher
 from fusion_center.center import Center
 from fusion_center.state import Event, Presence, Tick
@@ -110,8 +110,8 @@ class CenterShell:
         except DecodeError as error:
             self.complaints.add("bad bytes", str(error))
             return
-        if isinstance(message, Report | Join):
-            if isinstance(message, Report):
+        if isinstance(message, Report | Picked | Join):
+            if not isinstance(message, Join):
                 self._reported_s = time.monotonic()
             self._step(message)
         else:
@@ -162,7 +162,7 @@ class CenterShell:
 
 def _summary(event: Event) -> str:
     match event:
-        case Report():
+        case Report() | Picked():
             return f"{event.sensor} at {event.time_ns} ns, epoch {event.epoch}, {len(event.ids)} tracks"
         case Join():
             return f"{event.sensor} asks to join with the scenario of digest {event.digest}; the center's is another"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import permutations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -102,10 +103,10 @@ def test_it_does_not_matter_in_which_order_reports_come() -> None:
         # Four of them are shuffled, of different sensors and times.
         shuffled = [reports[2 + at] for at in order]
         for report in [*reports[:2], *shuffled, *reports[6:]]:
-            stage.tell(report._replace(next_ns=report.time_ns + 1), 1000.0)
+            stage.tell(report, 1000.0)
         stage.tick(2000.0)
-        np.testing.assert_allclose(stage.tracks().log_lr_total, whole.log_lr_total, rtol=1e-12)
-        np.testing.assert_allclose(stage.tracks().x, whole.x, rtol=1e-12)
+        np.testing.assert_allclose(stage.tracks.log_lr_total, whole.log_lr_total, rtol=1e-12)
+        np.testing.assert_allclose(stage.tracks.x, whole.x, rtol=1e-12)
 
 
 def test_a_network_in_memory_says_what_replay_says() -> None:
@@ -125,7 +126,7 @@ def test_a_sensor_that_joins_late_begins_with_the_fused_tracks() -> None:
         stage.tell(node.scan(scan, scan.time_ns + 1), 100.0)
     stage.tick(200.0)
     (start,) = only(type(stage.join_all(b=30.0)["b"]), stage.join("b", 30.0, incarnation=7, at_s=300.0))
-    np.testing.assert_array_equal(start.x, stage.tracks().x)
+    np.testing.assert_array_equal(start.x, stage.tracks.x)
     np.testing.assert_array_equal(start.times_ns, stage.state.picture.times_ns)
 
 
@@ -151,8 +152,8 @@ def test_plots_of_another_size_are_refused() -> None:
 
 
 @pytest.mark.parametrize("key", ['association = "tight"', 'feedback = "reset"'])
-def test_what_only_factors_have_is_a_fault(key: str, tmp_path: Any) -> None:
-    text = (load_scenario.__globals__["Path"]("scenarios/four-radars.toml")).read_text()
+def test_what_only_factors_have_is_a_fault(key: str, tmp_path: Path) -> None:
+    text = Path("scenarios/four-radars.toml").read_text()
     file = tmp_path / "bad.toml"
     lines = [line for line in text.splitlines() if not line.startswith(("association", "mode ="))]
     file.write_text("\n".join(lines).replace("[fusion]", f'[fusion]\nmode = "selected"\n{key}'))

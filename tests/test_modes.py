@@ -89,6 +89,22 @@ def test_a_run_is_the_replay_of_its_world(name: str) -> None:
             np.testing.assert_allclose(course.P[run, k], tracks.P[0], rtol=1e-8, atol=1e-8 * tracks.P[0].max())
 
 
+@pytest.mark.parametrize("name", ["federated-tight", "federated-mirrored-3", "selected-plots"])
+def test_so_it_is_with_sensors_of_other_kinds(name: str) -> None:
+    """Plots of range and azimuth, whose false ones are denser near by, and a radar with a clutter notch."""
+    view = {"shape": "disc", "radius": 9000.0}
+    few = {"kind": "polar", "p_d": 0.8, "false_plots": 30.0, "field_of_view": view, "sigma": [40.0, 0.01]}
+    notch = {"detection": {"model": "notch", "mdv": 20.0}}
+    plot = world(sensor_table("a", **few), sensor_table("b", **few, **notch, position=[0.0, -3000.0]))
+    worlds = draw(plot, SEEDS)
+    course = play(plot, name, worlds)
+    assert np.isfinite(course.log_lr).all() and (course.log_lr[:, -1] > 5.0).any()
+    for run, seed in enumerate(SEEDS):
+        replayed, _ = pictures(with_fusion(plot, **fusion_of(name)), int(seed))
+        for k, tracks in enumerate(replayed):
+            np.testing.assert_allclose(course.log_lr[run, k], tracks.log_lr_total[0], rtol=1e-8, atol=1e-8)
+
+
 def test_modes_differ() -> None:
     """Else the comparison above would show nothing. ``SAME`` have the log LR of another mode, at other bytes."""
     plot = world()

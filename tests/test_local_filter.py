@@ -79,6 +79,23 @@ def test_the_center_predicts_several_models_as_the_nodes_do(fusion: dict[str, An
         np.testing.assert_allclose(other.log_lr_total - one.log_lr_total, step, rtol=1e-9)
 
 
+def test_the_only_sensor_has_one_opinion_on_the_model() -> None:
+    """Its factor is the whole prior, so that it must believe of the models what the filter that associates believes."""
+    plot = scenario(sensor_table("a", p_d=0.8, false_plots=50.0), motion=imm(TURNS))
+    local, config = LocalFilter.of(plot), plot.sensors[0]
+    sensor, stand, center = config.build(local.motion), np.array([3000.0, 0.0]), np.zeros(2)
+    prior = Gaussian(*(part[None] for part in plot.hypotheses[0].density))
+    mixture, changed = local.start(prior), 0.0
+    for scan in simulate_all(plot, 3):
+        predicted = local.predict(mixture, np.array(2.0), np.array(2.0))
+        expected = local.expect(predicted.density, sensor, stand, center)
+        mixture = local.update(predicted, expected, Plots(scan.z), sensor, stand)
+        belief = mixture.log_g - np.logaddexp.reduce(mixture.log_g, axis=-1)[:, None]
+        np.testing.assert_allclose(mixture.log_w, belief, rtol=1e-9, atol=1e-9)
+        changed = max(changed, float(np.exp(mixture.log_w).max()))
+    assert changed > 0.5  # of three models
+
+
 def test_a_report_has_a_term_for_every_model() -> None:
     plot = network(imm(TURNS))
     local = LocalFilter.of(plot)

@@ -109,6 +109,22 @@ def test_it_does_not_matter_in_which_order_reports_come() -> None:
         np.testing.assert_allclose(stage.tracks.x, whole.x, rtol=1e-12)
 
 
+def test_sensors_of_one_time_take_turns_in_the_order_of_the_scenario() -> None:
+    """Hypotheses are combined in between, so that another order would give other digits."""
+    dense = {"p_d": 0.5, "false_plots": 4000.0}
+    plot = selecting(sensor_table("a", **dense), sensor_table("b", **dense))
+    scans = simulate_all(plot, 5)
+    whole = pictures(plot, scans)[-1]
+    stage = Stage(plot)
+    starts = stage.join_all(a=2.0, b=2.0)
+    nodes = {name: Node(plot, name, start) for name, start in starts.items()}
+    reports = [nodes[scan.sensor].scan(scan) for scan in scans]
+    for one, other in zip(reports[::2], reports[1::2], strict=True):
+        stage.tell(other._replace(next_ns=other.time_ns + 1), 1.0)
+        stage.tell(one._replace(next_ns=other.time_ns + 1), 1.0)
+    np.testing.assert_array_equal(stage.tracks.log_lr_total, whole.log_lr_total)
+
+
 def test_a_network_in_memory_says_what_replay_says() -> None:
     plot = selecting(decision={"p0": 1e-4, "p1": 0.95})
     scans = simulate_all(plot, 2)

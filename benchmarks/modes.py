@@ -2,8 +2,8 @@
 
     python -m benchmarks.modes [--scenario heavy-clutter] [--runs 100] [--soup-runs 3]
 
-Stone Soup's job is that of mode ``centralised``: PDA, sensor after sensor, on the very same plots of the first runs. That
-it is the same job is checked: its tracks must be those of the mode. It computes no likelihood ratio.
+Stone Soup's job is that of mode ``centralised``: PDA, sensor after sensor, on the very same plots of the first runs.
+That it is the same job is checked: its tracks must be those of the mode. It computes no likelihood ratio.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Latency of the steps that the processes take: a scan at a node, the last report of a time at the center.
 
-    python benchmarks/steps.py [--json FILE]
+    python benchmarks/steps.py [--scenario NAME] [--mode MODE] [--json FILE]
 
-Scenario four-radars after four scans of each radar, with one of its hypotheses, all five, or many more: from the scan
-to the report (``LocalTracker.scan``), and from the last of four reports to tracks and decisions (``Center.step``),
+A scenario (four-radars) after four scans of each radar, with one of its hypotheses, all five, or many more: from the
+scan to the report (``LocalTracker.scan``), and from the last of four reports to tracks and decisions (``Center.step``),
 without codec and bus. "Ahead" is with all that plots and reports do not change prepared while waiting; "prepares" is
 how long that takes. Microseconds a step; the columns are measured in turns, the figures are medians. Machines differ
 and are noisy.
@@ -17,11 +17,13 @@ import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from benchmarks.machine import machine
 from common.config import DecisionConfig, Scenario, load_scenario
+from common.fusion_config import FusionConfig
 from common.messages import Join, Scan, Start
 from fusion_center.center import Center
 from scenarios.catalogue import find
@@ -33,20 +35,28 @@ SCANS = 5
 ROUNDS, SLICE_S = 25, 0.005
 
 
-def network(tracks: int) -> Scenario:
-    """Four radars and so many hypotheses; where there are more than five nothing is decided, so that all stay."""
-    scenario = load_scenario(find("four-radars"))
+#: Keys of ``[fusion]``, as a live network would have them.
+MODES: dict[str, dict[str, Any]] = {
+    "tight": {},
+    "mirrored-3": {"association": "mirrored", "terms": 3},
+    "selected": {"mode": "selected"},
+}
+
+
+def network(name: str, mode: str, tracks: int) -> Scenario:
+    """A scenario with so many hypotheses; where there are more than five nothing is decided, so that all stay."""
+    scenario = load_scenario(find(name))
+    fusion = FusionConfig.model_validate(MODES[mode])
     first, rng = scenario.hypotheses[0], np.random.default_rng(1)
     drawn = [(*rng.uniform(-1.5e4, 1.5e4, 2).tolist(), *rng.normal(0.0, 100.0, 2).tolist()) for _ in range(tracks)]
     more = [first.model_copy(update={"state": state}) for state in drawn[5:]]
     decision = scenario.decision if tracks <= 5 else DecisionConfig(enabled=False)
     hypotheses = [*scenario.hypotheses, *more][:tracks]
-    return scenario.model_copy(update={"hypotheses": hypotheses, "decision": decision})
+    return scenario.model_copy(update={"hypotheses": hypotheses, "decision": decision, "fusion": fusion})
 
 
-def steps(tracks: int) -> dict[str, Callable[[], object]]:
+def steps(scenario: Scenario) -> dict[str, Callable[[], object]]:
     """The last radar's last scan and the center's last report of it, as calls that can be repeated."""
-    scenario = network(tracks)
     scans: dict[str, list[Scan]] = {name: simulate(scenario, name, 1) for name in scenario.sensor_names}
     trackers = {name: LocalTracker.of(scenario, name) for name in scans}
     center = Center.of(scenario)
@@ -88,9 +98,14 @@ def microseconds(works: dict[str, Callable[[], object]]) -> dict[str, float]:
 def main() -> None:
     """Print a table, and write JSON if asked."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="four-radars")
+    parser.add_argument("--mode", choices=tuple(MODES), default="tight")
     parser.add_argument("--json", type=Path, help="file to write the figures to")
     arguments = parser.parse_args()
-    about, rows = machine("numpy"), [{"tracks": tracks, **microseconds(steps(tracks))} for tracks in TRACKS]
+    about, rows = machine("numpy"), []
+    for tracks in TRACKS:
+        works = steps(network(arguments.scenario, arguments.mode, tracks))
+        rows.append({"tracks": tracks, **microseconds(works)})
     if arguments.json:
         arguments.json.write_text(json.dumps({"machine": about, "rows": rows}, indent=2) + "\n")
     print(", ".join(f"{key} {value}" for key, value in about.items()))

@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.special import gammaincinv
 
-from common.estimation.gating import inside_boxes
+from common.estimation.gating import Near, inside_boxes
 from common.estimation.gaussian import (
     LOG_2PI,
     Array,
@@ -240,7 +240,28 @@ def within_reach(expected: Expected, plots: Plots) -> Plots:
 
 def _inside_common_boxes(plots: Plots, center: Array, reach: Array) -> Plots:
     """Of scans that several tracks or components share, the plots inside the box around all their gates."""
-    low, high = center - reach, center + reach
+    which, inside = inside_common_boxes(plots, center, reach)
+    relative = plots.log_relative
+    return Plots(
+        np.take_along_axis(plots.z, which[..., None], axis=-2),
+        inside,
+        None if relative is None else np.take_along_axis(relative, which, axis=-1),
+    )
+
+
+def inside_common_boxes(plots: Plots, center: Array, reach: Array) -> Near:
+    """Of scans that several tracks or components share, which plots are inside the box around all their gates.
+
+    Args:
+        plots: z of shape (..., M, m), with size one where tracks share a scan.
+        center: expected plots, shape (..., m).
+        reach: half of each side of the boxes, shape (..., m); negative is no box.
+
+    Returns:
+        numbers of the plots, padded, with the batch axes of the scans.
+    """
+    none = (reach < 0.0).any(axis=-1, keepdims=True)
+    low, high = np.where(none, np.inf, center - reach), np.where(none, -np.inf, center + reach)
     shared = tuple(axis for axis, size in enumerate(plots.z.shape[:-2]) if size == 1)
     low, high = low.min(axis=shared, keepdims=True)[..., None, :], high.max(axis=shared, keepdims=True)[..., None, :]
     inside = ((low <= plots.z) & (plots.z <= high)).all(axis=-1)
@@ -248,13 +269,7 @@ def _inside_common_boxes(plots: Plots, center: Array, reach: Array) -> Plots:
         inside &= plots.valid
     most = int(inside.sum(axis=-1).max(initial=0))
     which = np.argsort(~inside, axis=-1, kind="stable")[..., :most]
-    z = np.take_along_axis(plots.z, which[..., None], axis=-2)
-    relative = plots.log_relative
-    return Plots(
-        z,
-        np.take_along_axis(inside, which, axis=-1),
-        None if relative is None else np.take_along_axis(relative, which, axis=-1),
-    )
+    return Near(which, np.take_along_axis(inside, which, axis=-1))
 
 
 @cache

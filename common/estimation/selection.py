@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import Expected, Plots, gate_threshold, innovations
+from common.estimation.association import Expected, Plots, gate_threshold, innovations, inside_common_boxes
 from common.estimation.gating import inside_boxes
 from common.estimation.gaussian import Array, BoolArray, squared_norm
 
@@ -43,12 +43,24 @@ def select(log_w: Array, expected: Expected, plots: Plots, how: Selection) -> Bo
     tracks, most = len(log_w), plots.z.shape[-2]
     if plots.z.ndim == 2 and log_w.size * most > _FEW_PAIRS and not expected.angular:
         return _select_near(counts, expected, plots, threshold)
+    if plots.z.ndim == 2 or expected.angular:
+        return np.broadcast_to(_inside(counts, expected, plots, threshold), (tracks, most))
+    reach = np.where(counts[..., None], np.sqrt(threshold) * expected.sigma[-1] * (1.0 + 1e-9), -1.0)
+    which, valid = inside_common_boxes(plots, expected.z[-1], reach)
+    near = Plots(np.take_along_axis(plots.z, which[..., None], axis=-2), valid)
+    chosen = np.zeros((tracks, most), np.bool_)
+    np.put_along_axis(chosen, which[:, 0], _inside(counts, expected, near, threshold), axis=-1)
+    return chosen
+
+
+def _inside(counts: BoolArray, expected: Expected, plots: Plots, threshold: float) -> BoolArray:
+    """The plots in the gate of any component that counts, every pair looked at, shape (T, M)."""
     nu = innovations(plots.z, expected.z[-1, :, :, None], expected.angular)
     distance = squared_norm(np.matvec(expected.whitener[-1, :, :, None], nu))
     inside = (distance <= threshold) & counts[..., None]
     if plots.valid is not None:
         inside &= plots.valid
-    return np.asarray(inside.any(axis=1)).reshape(tracks, most)
+    return np.asarray(inside.any(axis=1))
 
 
 def _select_near(counts: BoolArray, expected: Expected, plots: Plots, threshold: float) -> BoolArray:

@@ -7,9 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 from process_helpers import Processes
 
 from benchmarks.namespaces import Namespaces
+
+# The same examples every time; WALDNET_EXPLORE=1 looks for new ones.
+settings.register_profile("fixed", derandomize=True, deadline=None, database=None)
+if not os.environ.get("WALDNET_EXPLORE"):
+    settings.load_profile("fixed")
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -114,7 +114,7 @@ def test_a_batch_equals_the_loop(shape: tuple[int, ...], n_sensors: int, seed: i
     assert common.P.shape == predicted.P.shape == shrunk.shape == (*shape, 4, 4)
     for row in np.ndindex(shape):
         one = globalise(P[row])
-        np.testing.assert_allclose(common.P[row], one.P, rtol=1e-12)
+        np.testing.assert_allclose(common.P[row], one.P, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(common.G[row], one.G, rtol=1e-10, atol=1e-10)
         alone = share.predict(Gaussian(factor.x[row], factor.P[row]), MOTION, np.array(dt[row]))
         np.testing.assert_allclose(predicted.x[row], alone.x, rtol=1e-12, atol=1e-12)

@@ -47,10 +47,9 @@ def chosen(log_w: Array, density: Gaussian, z: Array, how: Selection) -> Array:
     for track, weights in enumerate(log_w):
         for component, weight in enumerate(weights):
             S = H @ density.P[0, track, component] @ H.T + R
-            for j, plot in enumerate(z):
-                nu = plot - H @ density.x[0, track, component]
-                inside = nu @ np.linalg.solve(S, nu) <= chi2.ppf(how.probability, 2)
-                found[track, j] |= np.exp(weight) >= how.weight and inside
+            nu = z - H @ density.x[0, track, component]
+            distance = (nu * np.linalg.solve(S, nu.T).T).sum(axis=1)
+            found[track] |= (np.exp(weight) >= how.weight) & (distance <= chi2.ppf(how.probability, 2))
     return found
 
 

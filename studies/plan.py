@@ -32,7 +32,6 @@ _SHOWING = {
     "figures",
     "importance",
     "lines",
-    "loss",
     "network",
     "progress",
     "record",

@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check lock bench figures clean
+.PHONY: help setup demo test check lock bench figures studies clean
 
 help: ## what can be made
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/'
@@ -49,6 +49,9 @@ bench: $(VENV)/test.stamp ## speed of the estimator beside Stone Soup, and of th
 
 figures: $(VENV)/test.stamp ## measure all figures of docs/performance.md anew (half an hour, needs root)
 	$(BIN)/python -m benchmarks.figures docs/performance.md
+
+studies: $(VENV)/test.stamp ## play all studies of docs/studies.md anew (an hour)
+	$(BIN)/python -m benchmarks.figures docs/studies.md
 
 clean: ## remove what was made
 	rm -rf $(VENV) runs .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build *.egg-info

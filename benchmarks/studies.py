@@ -45,7 +45,7 @@ class Published(NamedTuple):
 
 
 STUDIES = {
-    "webinar": Published("four-radars --p-d 0.9,0.5,0.2 --no-target", ("log_lr", "frontier")),
+    "webinar": Published("four-radars-0.2 --p-d 0.9,0.5,0.2 --no-target", ("log_lr",)),
     "heavy-clutter": Published("heavy-clutter --no-target", ("frontier", "calibration")),
     "rarely-seen": Published("rarely-seen --no-target", ("frontier", "calibration")),
     "thirty-two": Published(f"thirty-two --no-target --modes {_MANY_SENSORS}", ("frontier",)),

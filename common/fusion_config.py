@@ -58,7 +58,8 @@ class FusionConfig(BaseModel, extra="forbid", frozen=True):
         association: the factor's own, tight, or mirrored: hypotheses kept in both filters (theory.md §5).
         terms: most terms of a track in a report; more than one only where association is mirrored.
         feedback: advice gives the fused track back to the association filters, reset to the factors (theory.md §3, 6).
-        feedback_delay: measurement time that goes by before the center gives feedback [s], to study slow links.
+        feedback_delay: measurement time that goes by before feedback counts [s]; with reset, nobody is left out who
+            hears of it in that time.
         filter: local filter; default: mht where association is mirrored or mode selected, else pdaf.
         mixture: of filter mht.
         selection: of mode selected.

@@ -30,7 +30,7 @@ class Report(NamedTuple):
         sequence: number of the report since the node started.
         time_ns: time of the scan.
         next_ns: no later report of this sensor will be about an earlier time; NEVER ends the series.
-        epoch: of the start message the factors descend from.
+        epoch: of the start message or rebase the factors descend from.
         ids: tracks, ascending, shape (T,).
         terms: number of terms of each track, shape (T,), sum N.
         log_g: cumulative log p_bar (with one term) or log evidence g, shape (N,).
@@ -178,14 +178,14 @@ class Rebase(NamedTuple):
 
     Attributes:
         epoch: of the reports that descend from it.
-        given_ns: measurement time at which the center gives it.
-        time_ns: of the fused tracks.
+        after_ns: scans later than this do.
+        time_ns: of the fused tracks, when the center tells it.
         ids: tracks, ascending, shape (T,).
         x, P: fused densities, of which each factor takes its share, shapes (T, n), (T, n, n).
     """
 
     epoch: int
-    given_ns: int
+    after_ns: int
     time_ns: int
     ids: IntArray
     x: Array

@@ -171,6 +171,10 @@ class Center:
         return round(self.fusion.hold_back * NS_PER_S)
 
     @property
+    def _delay_ns(self) -> int:
+        return round(self.fusion.feedback_delay * NS_PER_S)
+
+    @property
     def _window_ns(self) -> int:
         return round(self.fusion.window * NS_PER_S)
 
@@ -179,9 +183,8 @@ class Center:
         number = self.names.index(join.sensor)
         member = state.members[number]
         epoch, lineage = member.epoch, member.lineage
-        picture, newest = self._newest(state)
         if not member.joined or join.incarnation != member.incarnation:
-            epoch, lineage = self._next_epoch(state), newest
+            epoch, lineage = self._next_epoch(state), state.lineage
         member = Member(
             joined=True,
             alive=True,
@@ -191,22 +194,16 @@ class Center:
             lineage=lineage,
         )
         state = state.with_member(number, member)
-        answer: list[Message] = [self._start(picture, number, epoch)]
+        answer: list[Message] = [self._start(state.picture, number, epoch)]
         if state.clock is not None:
-            advice = self._advice(state) if state.history and self.fusion.feedback == "advice" else []
-            answer += [*advice, state.clock]
+            advice = self._advice(state) if state.history else []
+            to_come = [told.rebase for told in state.told if told.rebase.epoch > state.lineage]
+            answer += [*advice, *to_come, state.clock]
         return state, answer
 
     def _next_epoch(self, state: State) -> int:
         told = [told.rebase.epoch for told in state.told]
         return 1 + max(self.first_epoch, *(member.epoch for member in state.members), *told)
-
-    def _newest(self, state: State) -> tuple[Picture, int]:
-        """The newest picture and its lineage, after the rebase that the nodes are about to follow."""
-        followed = self._followed(state, state.told[-1].rebase.epoch) if state.told else None
-        if followed is None:
-            return state.picture, state.lineage
-        return self.fuser.rebased(state.picture, followed[1], followed[0]), followed[0].epoch
 
     def _start(self, picture: Picture, number: int, epoch: int) -> Start:
         """The live tracks for one sensor."""
@@ -219,8 +216,9 @@ class Center:
         if report.sensor not in self.names:
             return None
         member = state.members[self.names.index(report.sensor)]
-        told = any(report.epoch == told.rebase.epoch > member.epoch for told in state.told)
-        if not member.joined or not (report.epoch == member.epoch or told) or report.next_ns <= report.time_ns:
+        to_follow = (told.rebase for told in state.told if told.rebase.epoch > member.lineage)
+        follows = any(report.epoch == rebase.epoch and report.time_ns > rebase.after_ns for rebase in to_follow)
+        if not member.joined or not (report.epoch == member.epoch or follows) or report.next_ns <= report.time_ns:
             return None
         if self._ahead(state.clock, report.time_ns, now_ns):
             return None
@@ -350,7 +348,7 @@ class Center:
         told = tuple(
             Told(rebase, pictures.get(rebase.time_ns, then))
             for rebase, then in state.told
-            if rebase.epoch == base.lineage or rebase.given_ns > base.time_ns - self._window_ns
+            if rebase.epoch == base.lineage or rebase.after_ns > base.time_ns - self._window_ns
         )
         state = state._replace(base=base.picture, base_ns=base.time_ns, base_lineage=base.lineage, told=told)
         deleted = [checkpoint.picture.ids[checkpoint.picture.status == DELETED] for checkpoint in gone]
@@ -377,28 +375,20 @@ class Center:
         return state._replace(clock=clock), [clock]
 
     def _advice(self, state: State) -> list[Message]:
-        """The fused tracks for the association filters, where that is wanted (theory.md §6)."""
+        """The fused tracks of the delay ago for the association filters, where that is wanted (theory.md §6)."""
         if self.fusion.feedback != "advice":
             return []
-        return [Advice(state.time_ns, *self._given(state))]
+        at = bisect_right(state.history, state.time_ns - self._delay_ns, key=lambda checkpoint: checkpoint.time_ns)
+        time_ns, picture = (state.history[at - 1].time_ns, state.history[at - 1].picture) if at else (0, state.base)
+        return [Advice(state.time_ns, time_ns, *_fused(picture, time_ns))]
 
     def _rebase(self, state: State) -> tuple[State, list[Message]]:
-        """Let all factors begin anew from the fused tracks, where that is wanted (theory.md §3)."""
+        """Let all factors begin anew from the fused tracks once the delay is over, where wanted (theory.md §3)."""
         if self.fusion.feedback != "reset":
             return state, []
-        rebase = Rebase(self._next_epoch(state), state.time_ns, *self._given(state))
-        if all(past.time_ns != rebase.time_ns for past in state.history):
-            # Nothing is old enough. In lockstep the nodes wait until they are told so; no node follows epoch 0.
-            return state, [rebase._replace(epoch=0)]
+        time_ns = state.time_ns
+        rebase = Rebase(self._next_epoch(state), time_ns + self._delay_ns, time_ns, *_fused(state.picture, time_ns))
         return state._replace(told=(*state.told, Told(rebase))), [rebase]
-
-    def _given(self, state: State) -> tuple[int, IntArray, Array, Array]:
-        """Time and fused live tracks that feedback is about: the newest that are as old as its delay."""
-        latest_ns = state.time_ns - round(self.fusion.feedback_delay * NS_PER_S)
-        at = bisect_right(state.history, latest_ns, key=lambda checkpoint: checkpoint.time_ns)
-        time_ns, picture = (state.history[at - 1].time_ns, state.history[at - 1].picture) if at else (0, state.base)
-        live = (picture.starts_ns <= time_ns) & (picture.status != DELETED)
-        return time_ns, picture.ids[live], picture.fused_x[live], picture.fused_P[live]
 
     def tracks(self, state: State) -> Tracks:
         """The newest picture as a message: all tracks that have started."""
@@ -416,6 +406,12 @@ class Center:
             x=picture.fused_x,
             P=picture.fused_P,
         )
+
+
+def _fused(picture: Picture, time_ns: int) -> tuple[IntArray, Array, Array]:
+    """Ids and fused densities of the tracks that live at the time of a picture."""
+    live = (picture.starts_ns <= time_ns) & (picture.status != DELETED)
+    return picture.ids[live], picture.fused_x[live], picture.fused_P[live]
 
 
 def _corrections(before: list[Decision], after: list[Decision]) -> list[Message]:

@@ -71,7 +71,7 @@ class Member(NamedTuple):
         incarnation: of its process.
         epoch: its reports must carry.
         next_ns: nothing earlier will come from it.
-        lineage: of its factors, before it follows a rebase.
+        lineage: of its factors when it joined.
     """
 
     joined: bool = False

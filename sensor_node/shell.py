@@ -204,7 +204,7 @@ class NodeShell:
                 self._advised_ns = max(message.given_ns, self._advised_ns or message.given_ns)
             case Rebase():
                 self._state = self._tracker.rebase(self._state, message)
-                self._advised_ns = max(message.given_ns, self._advised_ns or message.given_ns)
+                self._advised_ns = max(message.time_ns, self._advised_ns or message.time_ns)
             case Clock():
                 self._set_clock(message)
             case _:

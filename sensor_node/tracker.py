@@ -105,6 +105,8 @@ class State(NamedTuple):
         tracks: the tracks.
         recent: scans of the last few seconds, oldest first, for tracks and advice that come late.
         advice: not followed yet, oldest first.
+        lineage: epoch of the newest rebase followed since the start message; 0: none.
+        rebases: told, and not followed yet.
         ready: worked out ahead for the next scan, or None. It saves time and changes nothing.
     """
 
@@ -113,6 +115,8 @@ class State(NamedTuple):
     tracks: Tracks
     recent: tuple[Look, ...]
     advice: tuple[Advice, ...] = ()
+    lineage: int = 0
+    rebases: tuple[Rebase, ...] = ()
     ready: Ready | None = None
 
 
@@ -195,6 +199,7 @@ class LocalTracker:
 
     def prepare(self, state: State, time_ns: int, position: Array) -> State:
         """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
+        state = self._rebased(state, time_ns)
         return state._replace(ready=self._ready(state, time_ns, position))
 
     def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report | Picked]:
@@ -203,6 +208,7 @@ class LocalTracker:
 
     def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""
+        state = self._rebased(state, look.time_ns)
         ready = self._ready(state, look.time_ns, look.position)
         mixture = self._filtered(self.filter, ready.mixture, ready.expected, look)
         filtered = self._with(ready.predicted, mixture)
@@ -213,7 +219,8 @@ class LocalTracker:
             report: Report | Picked = self._report(state, look.time_ns, next_ns, filtered.ids, mixture)
         else:
             report = self._picked(state, look, next_ns, ready, self.selection)
-        return State(state.epoch, state.sequence + 1, tracks, (*kept, look), advice), report
+        sequence, recent = state.sequence + 1, (*kept, look)
+        return state._replace(sequence=sequence, tracks=tracks, recent=recent, advice=advice, ready=None), report
 
     def _picked(self, state: State, look: Look, next_ns: int, ready: Ready, selection: Selection) -> Picked:
         plots = look.plots
@@ -251,7 +258,7 @@ class LocalTracker:
             sequence=state.sequence,
             time_ns=time_ns,
             next_ns=next_ns,
-            epoch=state.epoch,
+            epoch=state.lineage or state.epoch,
             ids=ids,
             terms=there.sum(axis=-1),
             log_g=mixture.log_g[there],
@@ -262,23 +269,28 @@ class LocalTracker:
     def start(self, state: State, start: Start) -> State:
         """Take over tracks, and catch up on the scans since their start; a higher epoch names all tracks there are."""
         if start.epoch > state.epoch:
-            state = state._replace(tracks=self.initial().tracks)
-        fresh = take(self._fresh(start), ~np.isin(start.ids, state.tracks.ids))
-        return self._taken_over(state, start.epoch, fresh)
+            state = state._replace(epoch=start.epoch, tracks=self.initial().tracks, lineage=0, rebases=())
+        return self._taken_over(state, take(self._fresh(start), ~np.isin(start.ids, state.tracks.ids)))
 
     def rebase(self, state: State, rebase: Rebase) -> State:
-        """Begin anew from the fused tracks, and catch up on the scans since (theory.md §3)."""
-        if rebase.epoch <= state.epoch:
-            return state
-        mine = state.tracks
-        factor = self.filter.share.start(Gaussian(rebase.x, rebase.P))
-        times_ns, zero = np.full(len(rebase.ids), rebase.time_ns), np.zeros(len(rebase.ids))
-        start = Start("", rebase.epoch, rebase.ids, times_ns, zero, *factor, rebase.x, rebase.P)
-        fresh = take(self._fresh(start), np.isin(rebase.ids, mine.ids))
-        others = take(mine, ~np.isin(mine.ids, rebase.ids))
-        return self._taken_over(state._replace(tracks=others), rebase.epoch, fresh)
+        """Keep a rebase for the first scan that it holds for."""
+        return state if rebase.epoch <= state.lineage else state._replace(rebases=(*state.rebases, rebase))
 
-    def _taken_over(self, state: State, epoch: int, fresh: Tracks) -> State:
+    def _rebased(self, state: State, t_ns: int) -> State:
+        """Begin anew from the newest rebase that holds for a scan, and catch up on the scans since (theory.md §3)."""
+        holding = [rebase for rebase in state.rebases if rebase.after_ns < t_ns]
+        if not holding:
+            return state
+        told, mine = max(holding, key=lambda rebase: rebase.epoch), state.tracks
+        factor = self.filter.share.start(Gaussian(told.x, told.P))
+        times_ns, zero = np.full(len(told.ids), told.time_ns), np.zeros(len(told.ids))
+        start = Start("", told.epoch, told.ids, times_ns, zero, *factor, told.x, told.P)
+        fresh = take(self._fresh(start), np.isin(told.ids, mine.ids))
+        later = tuple(rebase for rebase in state.rebases if rebase.epoch > told.epoch)
+        state = state._replace(tracks=take(mine, ~np.isin(mine.ids, told.ids)), lineage=told.epoch, rebases=later)
+        return self._taken_over(state, fresh)
+
+    def _taken_over(self, state: State, fresh: Tracks) -> State:
         """The state with new tracks, which have seen the scans that are kept."""
         for look in state.recent:
             due = fresh.times_ns < look.time_ns
@@ -288,7 +300,7 @@ class LocalTracker:
                 fresh = _put(fresh, due, filtered)
         tracks = concatenate(*_alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
-        return state._replace(epoch=max(state.epoch, epoch), tracks=tracks)
+        return state._replace(tracks=tracks)
 
     def stop(self, state: State, stop: Stop) -> State:
         """Forget tracks."""

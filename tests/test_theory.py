@@ -147,7 +147,7 @@ def reference(network: Config, hypothesis: Config, looks: Sequence[Look]) -> Cou
 
 
 def reset_late(network: Config, hypothesis: Config, looks: Sequence[Look], delay: float) -> Course:
-    """One track where, after every measurement time, all begin anew from the fused track of ``delay`` seconds before.
+    """One track where all begin anew before every scan, from the newest fused track older than ``delay`` seconds.
 
     All sensors scan at the same times.
     """
@@ -155,8 +155,8 @@ def reset_late(network: Config, hypothesis: Config, looks: Sequence[Look], delay
     share, start = float(len(sensors)), float(hypothesis["start"])
     # While nothing is old enough nothing begins anew.
     course = reference(network | {"fusion": fusion | {"feedback": "none"}}, hypothesis, looks)
-    for last, time in pairwise(course):
-        since = max((past for past in course if past <= last - delay), default=start)
+    for time in course:
+        since = max((past for past in course if past < time - delay), default=start)
         if since == start:
             continue
         log_lr, *fused = course[since]

@@ -30,8 +30,9 @@ demo: $(VENV)/user.stamp ## four simulated radars, then a recorded ferry: proces
 	@echo "  plan.png        sensors, plots, tracks with 95 % ellipses"
 	@echo "  decisions.json  what was decided when;  tracks.jsonl  every track at every time;  logs/  of the processes"
 
+# A file stays with one process, which makes its fixtures once; in order, for by number of tests the longest come last.
 test: $(VENV)/test.stamp ## all tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest --numprocesses logical --dist loadfile --no-loadscope-reorder
 
 check: $(VENV)/test.stamp ## what CI checks beside the tests: format, lint, types, import rules
 	$(BIN)/ruff format --check .

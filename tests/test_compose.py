@@ -128,7 +128,9 @@ def containers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Containers]
         bus = stack.enter_context(open_zenoh(Network(mode="client", connect=(endpoint,))))
         observer = observe(bus, path)
         compose("up", "-d")
-        yield Containers(compose, path, processes, observer)
+        all_up = Containers(compose, path, processes, observer)
+        all_up.await_tracks()
+        yield all_up
 
 
 def test_decides_as_a_replay_does(containers: Containers) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 import study_fakes
 from builders import scenario, sensor_table
-from process_helpers import Processes
+from process_helpers import Process, Processes
 
 from common.errors import ConfigError, StudyError, TransportError, WaldnetError
 from studies import workers
@@ -329,6 +330,13 @@ def test_a_cluster_that_does_not_answer_is_told(fakes: None, tmp_path: Path, mon
             study.play(1, address, lambda _: None)
 
 
+def await_part(processes: Processes, study: Process, parts: Path) -> None:
+    """Return once a study has finished a part; the test's time limit is the patience."""
+    while not list(parts.glob("*.npz")):
+        assert study.pid in processes.alive(), study.err
+        time.sleep(0.05)  # the study needs the processor
+
+
 @pytest.mark.processes
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 @pytest.mark.parametrize("count", [1, 2])
@@ -341,8 +349,7 @@ def test_stopped_it_says_how_to_go_on_and_leaves_nobody_behind(
     options = ("--modes", "federated", "--runs", "2000", "--block", "1", "--out", "out", "--workers", count)
     process = processes.waldnet("study", path, *options)
     parts = tmp_path / "out/parts/as-given/federated"
-    while not (parts.exists() and list(parts.glob("*.npz"))):
-        assert process.pid in processes.alive(), process.err
+    await_part(processes, process, parts)
     family = processes.alive()
     process.signal(number)
     assert process.wait() == code
@@ -359,8 +366,7 @@ def test_workers_end_when_their_study_is_killed(processes: Processes, tmp_path: 
     options = ("--modes", "federated", "--runs", "2000", "--block", "1", "--out", "out", "--workers", 2)
     process = processes.waldnet("study", path, *options)
     parts = tmp_path / "out/parts/as-given/federated"
-    while not (parts.exists() and list(parts.glob("*.npz"))):
-        assert process.pid in processes.alive(), process.err
+    await_part(processes, process, parts)
     family = processes.alive()
     assert len(family) >= 3
     process.signal(signal.SIGKILL)

@@ -1,4 +1,4 @@
-"""Bytes per track and scan: reports, proposals, and the centralised alternative that sends all plots.
+"""Bytes per track and scan: reports, plots that tracks may start from, and the centralised way of sending all plots.
 
 Every sensor is a process that sends what a node sends, at scan rate, from a network namespace to a hub in another one.
 Payload bytes are those of the messages; wire bytes are what the hub's interface counted, both directions, so with

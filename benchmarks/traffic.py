@@ -3,9 +3,10 @@
     python -m benchmarks.traffic hub ADDRESS SENSORS
     python -m benchmarks.traffic sensor WORLD NAME KIND ADDRESS
 
-Messages, codec, keys and the settings of the network are the product's; kinds are ``reports``, ``proposals`` and
-``plots``, the last as a centralised tracker needs them: none may be lost. A sensor is told on standard input at which
-nanosecond of the monotonic clock to start, and says how large its payloads were.
+Messages, codec, keys and the settings of the network are the product's; kinds are ``reports``, ``proposals`` (reports
+without tracks, of the plots that none claims) and ``plots``, the last as a centralised tracker needs them: none may be
+lost. A sensor is told on standard input at which nanosecond of the monotonic clock to start, and says how large its
+payloads were.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from scipy.spatial import KDTree
 from benchmarks.worlds import World
 from common.codec import encode
 from common.config import Network
-from common.messages import Join, Keys, Message, Proposal, Scan, Start
+from common.messages import Join, Keys, Message, Report, Scan, Start
 from common.transport import open_zenoh
 from fusion_center.center import Center
 from sensor_node.tracker import LocalTracker
@@ -39,7 +40,7 @@ def messages(world: World, name: str, kind: str) -> Iterator[Message]:
     if kind == "plots":
         yield from scans
     elif kind == "proposals":
-        yield from (_proposal(world, name, scan) for scan in scans)
+        yield from (_proposals(world, scan) for scan in scans)
     else:
         yield from _reports(world, name, scans)
 
@@ -53,18 +54,34 @@ def _reports(world: World, name: str, scans: list[Scan]) -> Iterator[Message]:
         if isinstance(answer, Start):
             state = tracker.start(state, answer)
     for scan in scans:
-        state, report = tracker.scan(state, scan, scan.time_ns + round(1e9 * world.interval_s))
+        state, report = tracker.scan(state, scan, _next_ns(world, scan))
         yield report
 
 
-def _proposal(world: World, name: str, scan: Scan) -> Proposal:
-    """One new track for every plot that no target explains."""
+def _proposals(world: World, scan: Scan) -> Report:
+    """A report without tracks, of the plots that no target explains."""
     states = world.states()
     time_s = world.scenario().to_seconds(scan.time_ns)
     distances, _ = KDTree(states[:, :2] + time_s * states[:, 2:]).query(scan.z)
-    z = scan.z[distances > _UNCLAIMED_M]
-    x = np.concatenate([z, np.zeros_like(z)], axis=-1)
-    return Proposal(name, scan.time_ns, x, np.repeat(np.diag([2500.0, 2500.0, 400.0, 400.0])[None], len(z), axis=0))
+    none, n = np.empty(0, np.int64), states.shape[-1]
+    return Report(
+        sensor=scan.sensor,
+        sequence=0,
+        time_ns=scan.time_ns,
+        next_ns=_next_ns(world, scan),
+        epoch=1,
+        ids=none,
+        terms=none,
+        log_g=np.empty(0),
+        x=np.empty((0, n)),
+        P=np.empty((0, n, n)),
+        position=scan.position,
+        unclaimed=scan.z[distances > _UNCLAIMED_M],
+    )
+
+
+def _next_ns(world: World, scan: Scan) -> int:
+    return scan.time_ns + round(1e9 * world.interval_s)
 
 
 def sensor(world: World, name: str, kind: str, address: str) -> None:
@@ -106,7 +123,7 @@ def hub(address: str, sensors: int) -> None:
             complete.set()
 
     with open_zenoh(Network(name="bench", listen=(f"tcp/{address}:{PORT}",))) as bus:
-        for key in (_KEYS.report(), _KEYS.proposal(), _KEYS.plots()):
+        for key in (_KEYS.report(), _KEYS.plots()):
             bus.subscribe(key, came, on_miss=missed)
         bus.watch(_KEYS.sensor_alive(), present)
         bus.announce(_KEYS.center_alive())

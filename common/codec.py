@@ -20,13 +20,13 @@ from common.errors import DecodeError, VersionError
 from common.estimation.sprt import Status
 from common.messages import (
     Advice,
+    Begin,
     Clock,
     Decision,
     DecisionKind,
     Join,
     Message,
     Picked,
-    Proposal,
     Rebase,
     Report,
     Scan,
@@ -36,7 +36,7 @@ from common.messages import (
     sensor_of,
 )
 
-VERSION = 2
+VERSION = 3
 
 
 class Block(NamedTuple):
@@ -59,8 +59,19 @@ def _floats(field: str, *axes: str) -> Block:
     return Block(field, "<f8", axes)
 
 
+def _unclaimed(dtype: str) -> tuple[Block, ...]:
+    return _floats("position", "d"), Block("unclaimed", dtype, ("U", "m"))
+
+
 _IDS = Block("ids", "<u4", ("T",), "i8")
 _TERMS = Block("terms", "u1", ("T",), "i8")
+_BEGUN = (
+    _IDS,
+    Block("times_ns", "<i8", ("T",), "i8"),
+    _floats("x", "T", "n"),
+    _floats("P", "T", "n^"),
+    Block("ended", "<u4", ("E",), "i8"),
+)
 _PICKED = (Block("plots", "<u2", ("T",), "i8"), Block("which", "<u2", ("N",), "i8"))
 
 #: Kinds of reports whose densities or plots are rounded; log g, which grows without end, is not.
@@ -68,10 +79,20 @@ ROUNDED, ROUNDED_PLOTS = 10, 14
 
 #: Blocks of every kind of message; the number is the kind on the wire.
 LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
-    1: (Report, (_IDS, _TERMS, _floats("log_g", "N"), _floats("x", "N", "n"), _floats("P", "N", "n^"))),
+    1: (
+        Report,
+        (_IDS, _TERMS, _floats("log_g", "N"), _floats("x", "N", "n"), _floats("P", "N", "n^"), *_unclaimed("<f8")),
+    ),
     ROUNDED: (
         Report,
-        (_IDS, _TERMS, _floats("log_g", "N"), Block("x", "<f4", ("N", "n")), Block("P", "<f4", ("N", "n^"))),
+        (
+            _IDS,
+            _TERMS,
+            _floats("log_g", "N"),
+            Block("x", "<f4", ("N", "n")),
+            Block("P", "<f4", ("N", "n^")),
+            *_unclaimed("<f4"),
+        ),
     ),
     2: (Scan, (_floats("position", "d"), _floats("z", "M", "m"))),
     3: (Join, ()),
@@ -104,9 +125,9 @@ LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
         ),
     ),
     9: (Decision, ()),
-    11: (Proposal, (_floats("x", "T", "n"), _floats("P", "T", "n^"))),
-    13: (Picked, (_floats("position", "d"), _IDS, *_PICKED, _floats("z", "M", "m"))),
-    ROUNDED_PLOTS: (Picked, (_floats("position", "d"), _IDS, *_PICKED, Block("z", "<f4", ("M", "m")))),
+    11: (Begin, _BEGUN),
+    13: (Picked, (_IDS, *_PICKED, _floats("z", "M", "m"), *_unclaimed("<f8"))),
+    ROUNDED_PLOTS: (Picked, (_IDS, *_PICKED, Block("z", "<f4", ("M", "m")), *_unclaimed("<f4"))),
     12: (Rebase, (_IDS, _floats("x", "T", "n"), _floats("P", "T", "n^"))),
 }
 _KINDS = {message: kind for kind, (message, _) in LAYOUTS.items() if kind not in (ROUNDED, ROUNDED_PLOTS)}
@@ -114,7 +135,7 @@ _ROUNDED = {Report: ROUNDED, Picked: ROUNDED_PLOTS}
 #: No state is larger; keeps a forged header from asking for memory.
 _MAX_STATE = 64
 #: Messages whose sensor is the one in the key.
-_KEYED = (Report, Picked, Scan, Join, Start, Stop, Proposal)
+_KEYED = (Report, Picked, Scan, Join, Start, Stop)
 
 _TO_WIRE: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "str": str, "tuple": list}
 _EXPECTED = {"int": "a 64-bit integer", "float": "a finite float", "str": "a text", "tuple": "an array of texts"}
@@ -140,7 +161,9 @@ def encode(message: Message, *, rounded: bool = False) -> bytes:
     for block in LAYOUTS[kind][1]:
         array: _AnyArray = getattr(message, block.field)
         for axis, size in zip(block.axes, array.shape, strict=False):
-            sizes[axis.rstrip("^")] = size
+            assert sizes.setdefault(axis.rstrip("^"), size) == size, (
+                f"{block.field} is not as long as others along {axis}"
+            )
         if block.axes[-1].endswith("^"):
             array = array[..., *_upper(array.shape[-1])]
         wire = np.ascontiguousarray(array, dtype=block.dtype)
@@ -282,9 +305,10 @@ def _check_numbers(message: Message) -> None:
             bad = np.isnan(value) | (value == np.inf) if name.startswith("log_") else ~np.isfinite(value)
             if bad.any():
                 raise DecodeError(f"{name} has {int(bad.sum())} values that are not finite")
-    ids = getattr(message, "ids", None)
-    if ids is not None and (ids[1:] <= ids[:-1]).any():
-        raise DecodeError("ids are not ascending")
+    for name in ("ids", "ended"):
+        ids = getattr(message, name, None)
+        if ids is not None and (ids[1:] <= ids[:-1]).any():
+            raise DecodeError(f"{name} are not ascending")
 
 
 def _check_counts(message: Message) -> None:

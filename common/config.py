@@ -18,6 +18,7 @@ from common.estimation.gaussian import Gaussian
 from common.estimation.representation import Share
 from common.estimation.sprt import Thresholds, thresholds
 from common.fusion_config import FusionConfig, fusion_faults
+from common.initiation_config import InitiationConfig, initiation_faults
 from common.motion_config import MotionConfig, motion_faults, numbers_per_axis
 from common.quantities import (
     NS_PER_S,
@@ -82,16 +83,29 @@ class StudyConfig(Model):
 
 
 class SimulationConfig(Model):
-    """The simulated world: how long [s], and the seed of everything random."""
+    """The simulated world.
+
+    Attributes:
+        duration: how long [s].
+        seed: of everything random.
+        truth: recorded trajectories of further targets (JSON Lines), path relative to the scenario file.
+    """
 
     duration: Annotated[Positive, WITHIN_RANGE]
     seed: Count = 1
+    truth: Path | None = None
 
 
 class RecordingConfig(Model):
-    """Recorded plots (JSON Lines), path relative to the scenario file."""
+    """Recorded plots.
+
+    Attributes:
+        plots: JSON Lines, path relative to the scenario file.
+        ignore: sensors of the recording that the scenario does without.
+    """
 
     plots: Path
+    ignore: tuple[Name, ...] = ()
 
 
 class TargetConfig(Model):
@@ -134,6 +148,7 @@ class Scenario(Model):
     network: Network = Network()
     motion: MotionConfig
     decision: DecisionConfig = DecisionConfig()
+    initiation: InitiationConfig | None = None
     fusion: FusionConfig = FusionConfig()
     sensors: Annotated[tuple[SensorConfig, ...], Field(alias="sensor", min_length=1)]
     simulation: SimulationConfig | None = None
@@ -175,8 +190,13 @@ class Scenario(Model):
     @property
     def digest(self) -> str:
         """Of what node and center must have in common, or LR would be wrong without a word: models, fusion, sensors."""
-        common = self.model_dump_json(include={"epoch", "motion", "fusion", "sensors"})
+        common = self.model_dump_json(include={"epoch", "motion", "initiation", "fusion", "sensors"})
         return hashlib.sha256(common.encode()).hexdigest()[:16]
+
+    @property
+    def joint(self) -> bool:
+        """Whether tracks that share plots are associated jointly."""
+        return self.initiation is not None if self.fusion.joint is None else self.fusion.joint
 
     @property
     def share(self) -> Share:
@@ -200,10 +220,17 @@ def load_scenario(path: Path) -> Scenario:
         faults = [*_describe_all(error), *faults]
     if faults:
         raise ConfigError("\n".join(f"{path}: {fault}" for fault in faults))
-    if scenario.recording is not None:
-        plots = path.parent / scenario.recording.plots
-        scenario = scenario.model_copy(update={"recording": RecordingConfig(plots=plots)})
-    return scenario
+    return _beside(path.parent, scenario)
+
+
+def _beside(folder: Path, scenario: Scenario) -> Scenario:
+    """The scenario with its files where they are: relative paths count from its own folder."""
+    recording, simulation = scenario.recording, scenario.simulation
+    if recording is not None:
+        recording = recording.model_copy(update={"plots": folder / recording.plots})
+    if simulation is not None and simulation.truth is not None:
+        simulation = simulation.model_copy(update={"truth": folder / simulation.truth})
+    return scenario.model_copy(update={"recording": recording, "simulation": simulation})
 
 
 def load_network(path: Path) -> Network:
@@ -277,6 +304,7 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
             for i, entry in enumerate(_tables(data, kind)):
                 yield from wrong_length(entry, ("state", "sigma"), size, f"{kind}.{i}", why)
     yield from _repeated_names(sensors)
+    yield from _recording_faults(_table(data, "recording"), sensors)
     for i, target in enumerate(_tables(data, "target")):
         drawn = target.get("hypothesis")
         if (drawn is None) == (target.get("state") is None):
@@ -284,6 +312,8 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
         elif isinstance(drawn, int) and drawn >= len(hypotheses):
             yield f"target.{i}.hypothesis: {drawn} is not one of the {len(hypotheses)} hypotheses (counted from 0)"
     yield from _decision_faults(_table(data, "decision"))
+    kinds = [sensor.get("kind", "position") for sensor in sensors]
+    yield from initiation_faults(data.get("initiation"), _table(data, "fusion").get("window", 10.0), kinds)
     yield from fusion_faults(_table(data, "fusion"), motion.get("model"))
     if _table(data, "fusion").get("mode") == "dkf":
         yield from _dkf_faults(sensors)
@@ -317,6 +347,13 @@ def _repeated_names(sensors: list[Mapping[str, Any]]) -> Iterator[str]:
         if name == "center":
             yield f"sensor.{i}.name: 'center' is the name of the fusion center"
         seen.add(name if isinstance(name, str) else None)
+
+
+def _recording_faults(recording: Mapping[str, Any], sensors: list[Mapping[str, Any]]) -> Iterator[str]:
+    ignored = recording.get("ignore")
+    for name in ignored if isinstance(ignored, list) else ():
+        if any(sensor.get("name") == name for sensor in sensors):
+            yield f"recording.ignore: {name!r} is a sensor of this scenario"
 
 
 def _decision_faults(decision: Mapping[str, Any]) -> Iterator[str]:

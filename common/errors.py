@@ -8,6 +8,8 @@
     ├── DecodeError          bytes that are no message of ours
     │   └── VersionError     a message of another wire version
     ├── TransportError       the network: endpoint taken, nothing answers
+    ├── TruthError           a file of true positions is wrong; file and line named
+    ├── EvaluationError      a run to evaluate is wrong; file and line named
     ├── StudyError           workers of a study died, or are of another version
     └── LaunchError          a process of a run did not start, or died (launch/processes.py)
 """
@@ -37,6 +39,14 @@ class VersionError(DecodeError):
 
 class TransportError(WaldnetError):
     """The network does not do what was asked: an endpoint is taken, nothing answers."""
+
+
+class TruthError(WaldnetError):
+    """A file of true positions is wrong; the message names file and line."""
+
+
+class EvaluationError(WaldnetError):
+    """A run to evaluate is wrong, or it and the truth do not belong together; the message names file and line."""
 
 
 class StudyError(WaldnetError):

@@ -64,6 +64,8 @@ class FusionConfig(BaseModel, extra="forbid", frozen=True):
         mixture: of filter mht.
         selection: of mode selected.
         precision: of means and covariances in reports; float32 halves them.
+        joint: tracks near each other share plots jointly; else each is associated as if it were alone. Default: where
+            tracks start by themselves; given hypotheses may be about the same target.
         gate_probability: that the target's plot lies inside the gate; 1 is no gate.
         hold_back: how long the center waits for a sensor that is overdue [s].
         window: how far back a late report is still worked in [s of measurement time].
@@ -78,6 +80,7 @@ class FusionConfig(BaseModel, extra="forbid", frozen=True):
     mixture: MixtureConfig = MixtureConfig()
     selection: SelectionConfig = SelectionConfig()
     precision: Literal["float64", "float32"] = "float64"
+    joint: bool | None = None
     gate_probability: GateProbability = 0.9997
     hold_back: NotNegative = 0.5
     window: NotNegative = 10.0

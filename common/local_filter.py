@@ -7,10 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from common.config import Scenario
-from common.estimation.association import Choice, Clutter, Expected, Plots, expect, weigh_and_absorb, within_reach
+from common.estimation.association import (
+    Choice,
+    Clutter,
+    Expected,
+    Plots,
+    expect,
+    weigh_and_absorb,
+    weights_alone,
+    within_reach,
+)
 from common.estimation.detection import Notch
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp
 from common.estimation.imm import Imm, Modes, predict_modes
+from common.estimation.joint import joint
 from common.estimation.mixture import Mixture, Reduction, step, step_with, terms
 from common.estimation.motion import Motion
 from common.estimation.notch import hypotheses, merged
@@ -19,6 +29,8 @@ from common.estimation.sensing import Sensor
 
 #: The honest prior and noise of the association filter.
 HONEST = Share(1.0)
+#: Log odds of existence go no farther than this, so that a target that has gone is soon believed to be.
+SUREST = 7.0
 
 
 @dataclass(frozen=True)
@@ -120,33 +132,83 @@ class LocalFilter:
         clutter = Clutter(p_d, np.array(sensor.log_rho_f), self.gate_probability)
         return expect(density, sensor.measurement.linearise(density, stand), clutter)
 
-    def update(self, predicted: Mixture, expected: Expected, plots: Plots, sensor: Sensor, stand: Array) -> Mixture:
+    def near(self, expected: Expected, plots: Plots, sensor: Sensor, stand: Array) -> Plots:
+        """The plots near the tracks, and how dense false ones are there.
+
+        Args:
+            expected: the tracks as the sensor will see them.
+            plots: that all tracks share, z of shape (M, m), or of every track its own, z of shape (T, 1, M, m).
+            sensor: the sensor model.
+            stand: where it stands [m], shape (d,).
+
+        Returns:
+            what ``shared`` and ``update`` take.
+        """
+        relative = sensor.log_relative(plots.z, stand)
+        if relative is not None and plots.log_relative is not None:
+            relative = relative + plots.log_relative
+        plots = plots._replace(log_relative=plots.log_relative if relative is None else relative)
+        return within_reach(expected, plots)
+
+    def update(self, predicted: Mixture, expected: Expected, near: Plots, sensor: Sensor, stand: Array) -> Mixture:
         """Filter a scan.
 
         Args:
             predicted: the tracks.
             expected: the same, as the sensor will see them.
-            plots: that all tracks share, z of shape (M, m), or of every track its own, z of shape (T, 1, M, m).
+            near: the plots near them.
             sensor: the sensor model.
             stand: where it stands [m], shape (d,).
 
         Returns:
             the tracks after the scan.
         """
-        plots = plots._replace(log_relative=sensor.log_relative(plots.z, stand))
         if isinstance(sensor.detection, Notch):
-            given = hypotheses(expected, within_reach(expected, plots), sensor.detection, stand)
+            given = hypotheses(expected, near, sensor.detection, stand)
             if self.choice is None:
                 return step_with(predicted, *given, self.reduction)
             density, log_p_bar, log_q_bar = merged(given, self.choice)
         elif self.choice is None:
-            return step(predicted, expected, plots, self.reduction)
+            return step(predicted, expected, near, self.reduction)
         else:
-            density, log_p_bar, log_q_bar = weigh_and_absorb(expected, plots, self.choice)
+            density, log_p_bar, log_q_bar = weigh_and_absorb(expected, near, self.choice)
         if not isinstance(self.motion, Imm):
             return Mixture(predicted.log_w, predicted.log_g + log_p_bar, density)
         log_w = predicted.log_w + np.where(np.isfinite(log_q_bar), log_q_bar, 0.0)
         return Mixture(log_w - log_sum_exp(log_w)[:, None], predicted.log_g + log_p_bar, density)
+
+    def shared(
+        self,
+        predicted: Mixture,
+        expected: Expected,
+        near: Plots,
+        plots: int,
+        sensor: Sensor,
+        stand: Array,
+        existence: Array,
+    ) -> tuple[Plots, Array]:
+        """Associate tracks that share the plots of a scan (Eq. 21).
+
+        Args:
+            predicted: the tracks.
+            expected: the same, as the sensor will see them.
+            near: the plots near them, of one scan.
+            plots: how many the scan has.
+            sensor: the sensor model.
+            stand: where it stands [m], shape (d,).
+            existence: probability of each track to exist, before the scan, shape (T,).
+
+        Returns:
+            the plots, false ones the denser the more the other tracks claim them; and the probability of each plot of
+            the scan to be that of none of the tracks, shape (plots,).
+        """
+        if isinstance(sensor.detection, Notch):
+            alone = hypotheses(expected, near, sensor.detection, stand).log_p_star[-1]
+        else:
+            alone = weights_alone(expected, near)
+        log_nu, unclaimed = joint(predicted.log_w, alone, near.number, plots, existence)
+        log_relative = -log_nu if near.log_relative is None else near.log_relative - log_nu
+        return near._replace(log_relative=log_relative), unclaimed
 
     def report(self, mixture: Mixture) -> Mixture:
         """The terms of a report."""

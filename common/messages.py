@@ -18,6 +18,8 @@ IntArray = NDArray[np.int64]
 
 #: No report will follow: a source that is exhausted.
 NEVER = 2**63 - 1
+#: Where a report has no such field.
+_NOWHERE, _NO_PLOTS = np.empty(0), np.empty((0, 0))
 
 
 class Report(NamedTuple):
@@ -36,6 +38,8 @@ class Report(NamedTuple):
         log_g: cumulative log p_bar (with one term) or log evidence g, shape (N,).
         x: means, shape (N, n).
         P: covariances, shape (N, n, n).
+        position: where the sensor stood [m], shape (d,); with unclaimed plots only.
+        unclaimed: plots that no track claims, from which tracks may start (theory.md §8), shape (U, m).
     """
 
     sensor: str
@@ -48,6 +52,8 @@ class Report(NamedTuple):
     log_g: Array
     x: Array
     P: Array
+    position: Array = _NOWHERE
+    unclaimed: Array = _NO_PLOTS
 
 
 class Picked(NamedTuple):
@@ -64,6 +70,7 @@ class Picked(NamedTuple):
         plots: number of plots that matter to each track, shape (T,), sum N.
         which: their places in z, track after track, shape (N,).
         z: plots that matter to any track, shape (M, m).
+        unclaimed: plots that no track claims, from which tracks may start (theory.md §8), shape (U, m).
     """
 
     sensor: str
@@ -76,6 +83,7 @@ class Picked(NamedTuple):
     plots: IntArray
     which: IntArray
     z: Array
+    unclaimed: Array
 
 
 class Scan(NamedTuple):
@@ -92,21 +100,6 @@ class Scan(NamedTuple):
     time_ns: int
     position: Array
     z: Array
-
-
-class Proposal(NamedTuple):
-    """Tracks that a sensor proposes to start, from plots that no track claims (theory.md §8).
-
-    Attributes:
-        sensor: who proposes.
-        time_ns: of the scan.
-        x, P: densities, shapes (T, n), (T, n, n).
-    """
-
-    sensor: str
-    time_ns: int
-    x: Array
-    P: Array
 
 
 class Join(NamedTuple):
@@ -136,6 +129,7 @@ class Start(NamedTuple):
         log_p_bar: cumulative log p_bar so far, shape (T,).
         x, P: factors, shapes (T, n), (T, n, n).
         x_a, P_a: association filters, same shapes.
+        next_id: tracks that begin later have this id or a higher one.
     """
 
     sensor: str
@@ -147,6 +141,31 @@ class Start(NamedTuple):
     P: Array
     x_a: Array
     P_a: Array
+    next_id: int = NEVER
+
+
+class Begin(NamedTuple):
+    """Tracks that all nodes keep from a time on, begun from plots that none claimed, and tracks that claim no more.
+
+    A deleted track stays with the nodes until no late report can undo that; the plots of its target, if there is one
+    after all, start another one (theory.md §8).
+
+    Attributes:
+        epoch: nodes that follow this center have a higher one.
+        given_ns: measurement time at which the center gives it.
+        ids: tracks, ascending, shape (T,).
+        times_ns: times of the densities; scans later than this are used, shape (T,).
+        x, P: densities, of which each factor takes its share, shapes (T, n), (T, n, n).
+        ended: tracks that were deleted, ascending, shape (E,).
+    """
+
+    epoch: int
+    given_ns: int
+    ids: IntArray
+    times_ns: IntArray
+    x: Array
+    P: Array
+    ended: IntArray
 
 
 class Stop(NamedTuple):
@@ -235,19 +254,21 @@ class Tracks(NamedTuple):
     P: Array
 
 
-DecisionKind: TypeAlias = Literal["confirmed", "deleted", "withdrawn"]
+DecisionKind: TypeAlias = Literal["confirmed", "deleted", "merged", "withdrawn"]
 
 
 class Decision(NamedTuple):
     """One decision about one track.
 
     Attributes:
-        kind: confirmed, deleted, or withdrawn: a late report undid what was decided.
+        kind: confirmed; deleted; merged: it was another track's target; or withdrawn: a late report undid what was
+            decided.
         track: its id.
         time_ns: measurement time of the data that decided.
         log_lr: that crossed the threshold.
         log_lr_total: sum of all log Lambda since the start.
         scans: measurement times used since the start.
+        into: of a merged track, the one that stays; else -1.
     """
 
     kind: DecisionKind
@@ -256,11 +277,10 @@ class Decision(NamedTuple):
     log_lr: float
     log_lr_total: float
     scans: int
+    into: int = -1
 
 
-Message: TypeAlias = (
-    Report | Picked | Scan | Proposal | Join | Start | Stop | Advice | Rebase | Clock | Tracks | Decision
-)
+Message: TypeAlias = Report | Picked | Scan | Join | Start | Begin | Stop | Advice | Rebase | Clock | Tracks | Decision
 
 
 class Keys(NamedTuple):
@@ -275,10 +295,6 @@ class Keys(NamedTuple):
     def plots(self, sensor: str = "*") -> str:
         """Sensor node to whoever displays or records."""
         return f"waldnet/{self.network}/sensor/{sensor}/plots"
-
-    def proposal(self, sensor: str = "*") -> str:
-        """Sensor node to center."""
-        return f"waldnet/{self.network}/sensor/{sensor}/proposal"
 
     def join(self, sensor: str = "*") -> str:
         """Sensor node to center."""
@@ -327,13 +343,11 @@ class Keys(NamedTuple):
                 return self.report(message.sensor)
             case Scan():
                 return self.plots(message.sensor)
-            case Proposal():
-                return self.proposal(message.sensor)
             case Join():
                 return self.join(message.sensor)
             case Start() | Stop():
                 return self.command(message.sensor)
-            case Advice() | Rebase():
+            case Begin() | Advice() | Rebase():
                 return self.advice()
             case Clock():
                 return self.clock()

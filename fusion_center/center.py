@@ -8,7 +8,7 @@ does not depend on the order of arrival.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from common.fusion_config import FusionConfig
 from common.messages import (
     NEVER,
     Advice,
+    Begin,
     Clock,
     Decision,
     IntArray,
@@ -35,12 +36,14 @@ from common.messages import (
 )
 from common.quantities import NS_PER_S
 from fusion_center.factors import Fuser
+from fusion_center.initiation import Initiation, Unclaimed
 from fusion_center.picture import Picture
 from fusion_center.selected import SelectedFuser
 from fusion_center.state import (
     AnyExpected,
     AnyFuser,
     AnyHeard,
+    Begun,
     Checkpoint,
     Counts,
     Event,
@@ -64,6 +67,7 @@ class Center:
         fusion: hold-back, window, feedback.
         fuser: moves the picture.
         hypotheses: the tracks given by the scenario, as a picture.
+        initiation: how further tracks start; None: they do not.
         epoch_ns: the instant of scenario time 0.
         speed: seconds of measurement time per second, 0: lockstep.
         wait_ns: how long to wait for the others, once a sensor has joined, before the clock starts.
@@ -75,6 +79,7 @@ class Center:
     fusion: FusionConfig
     fuser: AnyFuser
     hypotheses: Picture
+    initiation: Initiation | None
     epoch_ns: int
     speed: float
     wait_ns: int
@@ -99,6 +104,7 @@ class Center:
             fusion=scenario.fusion,
             fuser=fuser,
             hypotheses=picture,
+            initiation=Initiation.of(scenario),
             epoch_ns=scenario.epoch_ns,
             speed=speed,
             wait_ns=round(wait_s * NS_PER_S),
@@ -117,6 +123,7 @@ class Center:
             base_ns=-NEVER,
             history=(),
             counts=Counts(),
+            next_id=len(self.hypotheses.ids),
         )
 
     def step(self, state: State, event: Event, now_ns: int) -> tuple[State, list[Message]]:
@@ -194,7 +201,7 @@ class Center:
             lineage=lineage,
         )
         state = state.with_member(number, member)
-        answer: list[Message] = [self._start(state.picture, number, epoch)]
+        answer: list[Message] = [self._start(state, number, epoch)]
         if state.clock is not None:
             advice = self._advice(state) if state.history else []
             to_come = [told.rebase for told in state.told if told.rebase.epoch > state.lineage]
@@ -205,11 +212,12 @@ class Center:
         told = [told.rebase.epoch for told in state.told]
         return 1 + max(self.first_epoch, *(member.epoch for member in state.members), *told)
 
-    def _start(self, picture: Picture, number: int, epoch: int) -> Start:
+    def _start(self, state: State, number: int, epoch: int) -> Start:
         """The live tracks for one sensor."""
+        picture = state.picture
         live = picture.status != DELETED
         backup = take(self.fuser.backup(picture, number), live)
-        return Start(self.names[number], epoch, picture.ids[live], *backup)
+        return Start(self.names[number], epoch, picture.ids[live], *backup, next_id=state.next_id)
 
     def _fitting(self, state: State, report: Report | Picked, now_ns: int) -> AnyHeard | None:
         """A report, if it comes from a sensor of this network and can be computed with."""
@@ -221,6 +229,8 @@ class Center:
         if not member.joined or not (report.epoch == member.epoch or follows) or report.next_ns <= report.time_ns:
             return None
         if self._ahead(state.clock, report.time_ns, now_ns):
+            return None
+        if self.initiation and not self.initiation.fits(report, self.names.index(report.sensor)):
             return None
         return self.fuser.heard(report)
 
@@ -252,21 +262,27 @@ class Center:
         if report.time_ns <= state.base_ns:
             return state.counted("too_late"), []
         at = bisect_left(state.history, report.time_ns, key=lambda checkpoint: checkpoint.time_ns)
-        groups = {checkpoint.time_ns: checkpoint.reports for checkpoint in state.history[at:]}
+        past = {checkpoint.time_ns: checkpoint for checkpoint in state.history[at:]}
+        groups = {time_ns: checkpoint.reports for time_ns, checkpoint in past.items()}
         group = groups.get(report.time_ns, {})
         if number in group:
             return state.counted("repeated"), []
         groups[report.time_ns] = {**group, number: heard}
-        before = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
+        before = [decision for checkpoint in past.values() for decision in checkpoint.decisions]
         state = state._replace(history=state.history[:at]).counted("late")
         pictures: list[Message] = []
         for time_ns in sorted(groups):
-            state = self._work_in(state, time_ns, groups[time_ns])
+            # What the nodes were told has begun, and no more than that.
+            begun = past[time_ns].begun if time_ns in past else self._nothing
+            state = self._work_in(state, time_ns, groups[time_ns], begun)
             pictures += [self.tracks(state), *self._advice(state)]
         after = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
-        return state, [*_corrections(before, after), *pictures]
+        return state, [*_corrections(before, after), *pictures, *self._begun(state, after)]
 
-    def _work_in(self, state: State, time_ns: int, reports: Mapping[int, AnyHeard]) -> State:
+    def _work_in(
+        self, state: State, time_ns: int, reports: Mapping[int, AnyHeard], begun: Begun | None = None
+    ) -> State:
+        """Work in the reports of a measurement time; ``begun``: that have begun then already."""
         followed = self._followed(state, max(heard.lineage for heard in reports.values()))
         if followed is None:
             lineage, expected = state.lineage, self._expected(state, time_ns)
@@ -277,8 +293,37 @@ class Center:
         # A node that has not followed yet speaks of factors that are no more.
         heard = {number: heard for number, heard in reports.items() if heard.lineage == lineage}
         picture, decisions = self.fuser.advance(expected, heard)
-        checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), lineage)
+        if self.initiation is not None:
+            picture, merged = self.initiation.merged(picture)
+            decisions += merged
+            begun = begun or self._seeds(state, self.initiation, picture, reports)
+            picture = self.fuser.begin(picture, begun.ids, np.full(len(begun.ids), time_ns), begun.density)
+            state = state._replace(next_id=max([state.next_id, *(begun.ids + 1).tolist()]))
+        checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), begun, lineage)
         return state._replace(history=(*state.history, checkpoint))
+
+    def _seeds(self, state: State, initiation: Initiation, picture: Picture, reports: Mapping[int, AnyHeard]) -> Begun:
+        """The tracks that begin at the measurement time of a picture (theory.md §8)."""
+        before = [scan for past in state.history for scan in _unclaimed(past.reports)]
+        density = initiation.seeds(picture, _unclaimed(reports), before)
+        return Begun(state.next_id + np.arange(len(density.x)), density)
+
+    @property
+    def _nothing(self) -> Begun | None:
+        """Of late reports no track begins: the nodes, which went on without, have what they need to start it later."""
+        n = self.hypotheses.x0.shape[1]
+        return Begun(np.empty(0, np.int64), Gaussian(np.empty((0, n)), np.empty((0, n, n))))
+
+    def _begun(self, state: State, decisions: Sequence[Decision]) -> list[Message]:
+        """The tracks that began at the newest time, and those that were deleted; in lockstep nodes wait for word."""
+        begun = state.history[-1].begun
+        if begun is None:
+            return []
+        ended = np.unique([decision.track for decision in decisions if decision.kind in ("deleted", "merged")])
+        if not len(begun.ids) and not len(ended) and self.speed > 0.0:
+            return []
+        times_ns = np.full(len(begun.ids), state.time_ns)
+        return [Begin(self.first_epoch, state.time_ns, begun.ids, times_ns, *begun.density, ended.astype(np.int64))]
 
     def _lineage(self, state: State, number: int, report: Report | Picked) -> int:
         """Epoch of the rebase that a report's factors descend from."""
@@ -328,7 +373,12 @@ class Center:
                 break
             rest = {time: group for time, group in state.waiting.items() if time != time_ns}
             state = self._work_in(state._replace(waiting=rest), time_ns, waiting.reports)
-            messages += [*state.history[-1].decisions, self.tracks(state), *self._advice(state)]
+            messages += [
+                *state.history[-1].decisions,
+                self.tracks(state),
+                *self._begun(state, state.history[-1].decisions),
+            ]
+            messages += self._advice(state)
             state, rebase = self._rebase(state)
             state, stops = self._forget(state)
             messages += [*rebase, *stops]
@@ -352,9 +402,9 @@ class Center:
         )
         state = state._replace(base=base.picture, base_ns=base.time_ns, base_lineage=base.lineage, told=told)
         deleted = [checkpoint.picture.ids[checkpoint.picture.status == DELETED] for checkpoint in gone]
-        if not any(map(len, deleted)):
-            return state, []
         ids = np.unique(np.concatenate(deleted))
+        if not len(ids):
+            return state, []
         members = zip(self.names, state.members, strict=True)
         return state, [Stop(name, ids) for name, member in members if member.joined]
 
@@ -412,6 +462,12 @@ def _fused(picture: Picture, time_ns: int) -> tuple[IntArray, Array, Array]:
     """Ids and fused densities of the tracks that live at the time of a picture."""
     live = (picture.starts_ns <= time_ns) & (picture.status != DELETED)
     return picture.ids[live], picture.fused_x[live], picture.fused_P[live]
+
+
+def _unclaimed(reports: Mapping[int, AnyHeard]) -> list[Unclaimed]:
+    """The plots of one measurement time that no track claims, by sensor."""
+    said = ((number, reports[number].report) for number in sorted(reports))
+    return [Unclaimed(said.time_ns, number, said.position, said.ids, said.unclaimed) for number, said in said]
 
 
 def _corrections(before: list[Decision], after: list[Decision]) -> list[Message]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
 from common.config import Scenario, SensorConfig
 from common.estimation.association import Plots
@@ -14,8 +15,8 @@ from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, moments
 from common.estimation.mixture import Mixture
 from common.estimation.sensing import Sensor
-from common.estimation.sprt import DELETED, TENTATIVE, Thresholds
-from common.local_filter import LocalFilter
+from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds
+from common.local_filter import SUREST, LocalFilter
 from common.messages import Decision, IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
 from fusion_center.picture import Backup, Picture, common, decided
@@ -55,6 +56,24 @@ class ExpectedTracks(NamedTuple):
     mixture: Mixture
 
 
+class _Seen(NamedTuple):
+    """What one sensor saw.
+
+    Attributes:
+        number: of the sensor.
+        position: where it stood [m], shape (d,).
+        plots: of every track its own.
+        many: how many there are in all.
+        existence: probability of the tracks to exist, before, shape (T,).
+    """
+
+    number: int
+    position: Array
+    plots: Plots
+    many: int
+    existence: Array
+
+
 @dataclass(frozen=True)
 class SelectedFuser:
     """The steps of a picture whose tracks are mixtures of the center's own: the only factor of a track is the whole.
@@ -63,11 +82,13 @@ class SelectedFuser:
         filter: predicts and filters the tracks.
         sensors: as the scenario describes them, and their models.
         limits: thresholds of the test, or None: nothing is decided.
+        joint: tracks that share plots are associated jointly (Eq. 21).
     """
 
     filter: LocalFilter
     sensors: tuple[tuple[SensorConfig, Sensor], ...]
     limits: Thresholds | None
+    joint: bool
 
     @classmethod
     def of(cls, scenario: Scenario) -> SelectedFuser:
@@ -77,6 +98,7 @@ class SelectedFuser:
             filter=local,
             sensors=tuple((config, config.build(local.motion)) for config in scenario.sensors),
             limits=scenario.decision.thresholds if scenario.decision.enabled else None,
+            joint=scenario.joint,
         )
 
     def empty(self) -> Picture:
@@ -125,9 +147,9 @@ class SelectedFuser:
         if report.z.shape[-1] != sensor.measurement.m or report.position.shape != stand.shape:
             return None
         valid = np.arange(int(report.plots.max(initial=0))) < report.plots[:, None]
-        z = np.zeros((*valid.shape, report.z.shape[-1]))
-        z[valid] = report.z[report.which]
-        return HeardPlots(report, Plots(z[:, None], valid[:, None]))
+        z, number = np.zeros((*valid.shape, report.z.shape[-1])), np.zeros(valid.shape, np.intp)
+        z[valid], number[valid] = report.z[report.which], report.which
+        return HeardPlots(report, Plots(z[:, None], valid[:, None], number=number[:, None]))
 
     def backup(self, picture: Picture, number: int) -> Backup:  # noqa: ARG002 (the same for every sensor)
         """What a sensor that joins goes on from: the fused tracks, as its own only say which plots matter."""
@@ -160,14 +182,16 @@ class SelectedFuser:
             the picture at the measurement time and what was decided.
         """
         picture, mixture = expected.moving, expected.mixture
+        existence = self._existence(picture)
         who = np.zeros(picture.reported.shape, np.bool_)
         for number in sorted(reports):
             report, plots, _ = reports[number]
             rows, others = common(picture.ids, report.ids)
             who[rows, number] = True
-            assert plots.valid is not None
-            theirs = Plots(plots.z[others], plots.valid[others])
-            mixture = self._filtered(mixture, rows, number, report.position, theirs)
+            assert plots.valid is not None and plots.number is not None
+            theirs = Plots(plots.z[others], plots.valid[others], number=plots.number[others])
+            seen = _Seen(number, report.position, theirs, len(report.z), existence[rows])
+            mixture = self._filtered(mixture, rows, seen)
         # Weights start each time with sum one, so their sum is the evidence of this time alone.
         step = log_sum_exp(mixture.log_g)
         x, P = mixture.density.x[0], mixture.density.P[0]
@@ -191,13 +215,24 @@ class SelectedFuser:
         kept, moved = _alike(expected.kept, moved)
         return put(kept, expected.live, moved), decisions
 
-    def _filtered(self, mixture: Mixture, rows: IntArray | slice, number: int, stand: Array, plots: Plots) -> Mixture:
+    def _existence(self, picture: Picture) -> Array:
+        """Probability of the tracks to exist; confirmation, which begins log LR anew, has gained log B."""
+        gained = 0.0 if self.limits is None else self.limits.log_b
+        odds = picture.log_lr + np.where(picture.status == CONFIRMED, gained, 0.0)
+        existence: Array = expit(np.clip(odds, -SUREST, SUREST))
+        return existence
+
+    def _filtered(self, mixture: Mixture, rows: IntArray | slice, seen: _Seen) -> Mixture:
         """The mixtures after a scan of one sensor; tracks that it does not know stay as they are."""
-        config, sensor = self.sensors[number]
+        config, sensor = self.sensors[seen.number]
+        stand = seen.position
         density = Gaussian(*(part[:, rows] for part in mixture.density))
         mine = Mixture(mixture.log_w[rows], mixture.log_g[rows], density)
         expected = self.filter.expect(mine.density, sensor, stand, config.view_center(stand))
-        mine = self.filter.update(mine, expected, plots, sensor, stand)
+        near = self.filter.near(expected, seen.plots, sensor, stand)
+        if self.joint and len(seen.existence) > 1:
+            near, _ = self.filter.shared(mine, expected, near, seen.many, sensor, stand, seen.existence)
+        mine = self.filter.update(mine, expected, near, sensor, stand)
         if isinstance(rows, slice):
             return mine
         size = max(mixture.log_w.shape[1], mine.log_w.shape[1])

@@ -82,6 +82,18 @@ class Member(NamedTuple):
     lineage: int = 0
 
 
+class Begun(NamedTuple):
+    """Tracks that began at one measurement time.
+
+    Attributes:
+        ids: ascending, shape (T,).
+        density: shapes (T, n), (T, n, n).
+    """
+
+    ids: IntArray
+    density: Gaussian
+
+
 class Checkpoint(NamedTuple):
     """One measurement time, worked in.
 
@@ -90,6 +102,7 @@ class Checkpoint(NamedTuple):
         reports: by number of the sensor.
         picture: after them.
         decisions: made then.
+        begun: tracks that began then; None: none ever do.
         lineage: epoch of the rebase that the factors of the picture descend from; 0: none.
     """
 
@@ -97,6 +110,7 @@ class Checkpoint(NamedTuple):
     reports: Mapping[int, AnyHeard]
     picture: Picture
     decisions: tuple[Decision, ...]
+    begun: Begun | None = None
     lineage: int = 0
 
 
@@ -154,6 +168,7 @@ class State(NamedTuple):
         history: checkpoints inside the window, oldest first.
         counts: of reports.
         told: the rebases that reports may descend from, oldest first.
+        next_id: of the next track that begins.
         expected: worked out ahead for the next measurement time, or None. It saves time and changes nothing.
     """
 
@@ -167,6 +182,7 @@ class State(NamedTuple):
     counts: Counts
     base_lineage: int = 0
     told: tuple[Told, ...] = ()
+    next_id: int = 0
     expected: AnyExpected | None = None
 
     @property

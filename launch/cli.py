@@ -24,6 +24,7 @@ from fusion_center.app import center
 from scenarios.catalogue import find, names
 from sensor_node.app import node
 from studies.cli import study
+from studies.evaluate.cli import evaluate
 
 app = App(
     name="waldnet",
@@ -33,6 +34,7 @@ app = App(
 app.command(node)
 app.command(center)
 app.command(study)
+app.command(evaluate)
 app.command(bench)
 
 
@@ -116,33 +118,41 @@ def replay(
 
 
 @app.command
-def simulate(scenario: str, *, seed: Seed | None = None, out: Path | None = None) -> None:
+def simulate(scenario: str, *, seed: Seed | None = None, out: Path | None = None, truth: Path | None = None) -> None:
     """Write the plots of a simulated world as JSON Lines: those that the processes of ``waldnet run`` will see.
 
     Args:
         scenario: scenario file, or name of one that comes along.
         seed: of everything random, instead of the scenario's.
         out: file to write; default standard output.
+        truth: file to write the targets' true positions to (JSON Lines), for waldnet evaluate.
     """
     from scenarios.plots import write_plots
+    from scenarios.truth import write_truth
     from scenarios.world import simulate_all
+    from scenarios.world import truth as true_states
     from sensor_node.sources import seed_of
 
     loaded = load_scenario(find(scenario))
-    scans = simulate_all(loaded, seed_of(loaded, seed))
+    seed = seed_of(loaded, seed)
+    scans = simulate_all(loaded, seed)
+    if truth is not None:
+        with truth.open("w", encoding="utf-8") as file:
+            write_truth(file, *true_states(loaded, seed), loaded)
     with out.open("w", encoding="utf-8") if out else nullcontext(sys.stdout) as file:
         write_plots(file, scans, loaded)
 
 
 @app.command
 def check(scenario: str, plots: Path | None = None) -> None:
-    """Validate a scenario file, and its recorded plots if it has any.
+    """Validate a scenario file, and its recorded plots and trajectories if it has any.
 
     Args:
         scenario: scenario file, or name of one that comes along.
         plots: recorded plots to validate too, instead of the scenario's.
     """
     from scenarios.plots import read_plots
+    from scenarios.trajectories import read_trajectories
 
     loaded = load_scenario(find(scenario))
     fusion = loaded.fusion
@@ -154,6 +164,8 @@ def check(scenario: str, plots: Path | None = None) -> None:
     if recording is not None:
         scans = read_plots(recording, loaded)
         print(f"{recording}: {len(scans)} scans, {sum(len(scan.z) for scan in scans)} plots")
+    if trajectories := read_trajectories(loaded):
+        print(f"recorded targets: {len(trajectories)}")
 
 
 @app.command

@@ -2,7 +2,8 @@
 
 Every process derives the same truth from the seed, and its own plots from the seed and the sensor's name; so what
 ``waldnet simulate`` writes is what the processes of ``waldnet run`` see. The truth is drawn at the scan times of the
-network, so a sensor with other scan times makes another path of the same seed.
+network, so a sensor with other scan times makes another path of the same seed. Recorded targets are where they were
+with any seed.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from common.estimation.imm import draw_path
 from common.estimation.sensing import Sensor
 from common.messages import IntArray, Scan
 from common.quantities import NS_PER_S
+from scenarios.trajectories import read_trajectories
 
 
 class Truth(NamedTuple):
@@ -25,7 +27,7 @@ class Truth(NamedTuple):
 
     Attributes:
         times_ns: all scan times of the network, ascending, shape (K,).
-        x: states, shape (targets, K, n); NaN before a target's start.
+        x: states, recorded targets last, shape (targets, K, n); NaN before a target's start and after its end.
     """
 
     times_ns: IntArray
@@ -47,13 +49,21 @@ def scan_times_ns(scenario: Scenario, sensor: SensorConfig) -> IntArray:
 
 
 def truth(scenario: Scenario, seed: int) -> Truth:
-    """True states of all targets at all scan times of the network."""
+    """True states of all targets at all scan times of the network.
+
+    Raises:
+        ConfigError: when the scenario describes no simulation.
+        TruthError: when the file of recorded targets is wrong.
+    """
     per_sensor = [scan_times_ns(scenario, sensor) for sensor in scenario.sensors]
     times_ns = np.unique(np.concatenate(per_sensor))
-    x = np.full((len(scenario.targets), len(times_ns), scenario.motion.build().n), np.nan)
+    n, recorded = scenario.motion.build().n, read_trajectories(scenario)
+    x = np.full((len(scenario.targets) + len(recorded), len(times_ns), n), np.nan)
     for number, target in enumerate(scenario.targets):
         rng = np.random.default_rng([seed, 1, number])
         x[number] = _path(scenario, target, times_ns, rng)
+    for number, trajectory in enumerate(recorded, start=len(scenario.targets)):
+        x[number] = trajectory.states(times_ns, n)
     return Truth(times_ns, x)
 
 

@@ -15,7 +15,7 @@ from common.errors import ConfigError, DecodeError, TransportError, VersionError
 from common.health import Health, age_s
 from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
-from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Rebase, Scan, Start, Stop
+from common.messages import NEVER, Advice, Begin, Clock, Join, Keys, Message, Rebase, Scan, Start, Stop
 from common.transport import Bus, Publisher
 from sensor_node.tracker import LocalTracker
 
@@ -188,27 +188,35 @@ class NodeShell:
             self.complaints.add("bad bytes", str(error))
             return
         match message:
-            case Start() | Advice() | Rebase() if message.x.shape[-1] != self._tracker.filter.motion.n:
+            case Start() | Begin() | Advice() | Rebase() if message.x.shape[-1] != self._tracker.filter.motion.n:
                 raise ConfigError(
                     f"{key}: states of {message.x.shape[-1]} numbers, "
                     f"this node's have {self._tracker.filter.motion.n}: do center and node run the same scenario?"
                 )
-            case Start():
-                self._answered = True
-                self._state = self._tracker.start(self._state, message)
-                self._log.info("tracks started", tracks=message.ids.tolist(), epoch=message.epoch)
-            case Stop():
-                self._state = self._tracker.stop(self._state, message)
-            case Advice():
-                self._state = self._tracker.advise(self._state, message)
-                self._advised_ns = max(message.given_ns, self._advised_ns or message.given_ns)
-            case Rebase():
-                self._state = self._tracker.rebase(self._state, message)
-                self._advised_ns = max(message.time_ns, self._advised_ns or message.time_ns)
+            case Start() | Begin() | Stop() | Advice() | Rebase():
+                self._state = self._tracker.told(self._state, message)
+                self._note(message)
             case Clock():
                 self._set_clock(message)
             case _:
                 self.complaints.add("unexpected", f"{key}: a {type(message).__name__} from the center")
+
+    def _note(self, message: Start | Begin | Stop | Advice | Rebase) -> None:
+        """Up to which measurement time the center has told what the node waits for in lockstep."""
+        match message:
+            case Start():
+                self._answered = True
+                self._log.info("tracks started", tracks=message.ids.tolist(), epoch=message.epoch)
+                return
+            case Begin() if not self._tracker.advised:
+                given_ns = message.given_ns
+            case Advice():
+                given_ns = message.given_ns
+            case Rebase():
+                given_ns = message.time_ns
+            case _:
+                return
+        self._advised_ns = max(given_ns, self._advised_ns or given_ns)
 
     def _set_clock(self, clock: Clock) -> None:
         first = self._clock is None

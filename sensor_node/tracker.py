@@ -12,17 +12,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import expit
 
 from common.config import Scenario, SensorConfig
 from common.estimation.association import Expected, Plots
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian
+from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
 from common.estimation.mixture import Mixture
 from common.estimation.representation import globalise, shrink
 from common.estimation.selection import Selection, select
 from common.estimation.sensing import Sensor
-from common.local_filter import LocalFilter
-from common.messages import Advice, IntArray, Picked, Rebase, Report, Scan, Start, Stop
+from common.local_filter import SUREST, LocalFilter
+from common.messages import Advice, Begin, IntArray, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
 
 
@@ -37,6 +38,7 @@ class Tracks(NamedTuple):
         x, P: factors, shapes (T, C, n), (T, C, n, n).
         times_a_ns: of the association filters, shape (T,).
         x_a, P_a: association filters.
+        log_odds: of existence, as far as this sensor knows, shape (T,).
         network_P: for ``dkf``, the covariances that all sensors' factors have by the models alone, shape
             (T, S, n, n); otherwise S = 0.
     """
@@ -50,6 +52,7 @@ class Tracks(NamedTuple):
     times_a_ns: IntArray
     x_a: Array
     P_a: Array
+    log_odds: Array
     network_P: Array
 
 
@@ -89,11 +92,13 @@ class Look(NamedTuple):
         time_ns: of the scan.
         position: where the sensor stood [m], shape (d,).
         plots: that all tracks share; in a study, where all tracks start together, of every track its own.
+        log_free: log probability of each plot to belong to none of the tracks there were; None: not told.
     """
 
     time_ns: int
     position: Array
     plots: Plots
+    log_free: Array | None = None
 
 
 class State(NamedTuple):
@@ -107,6 +112,8 @@ class State(NamedTuple):
         advice: not followed yet, oldest first.
         lineage: epoch of the newest rebase followed since the start message; 0: none.
         rebases: told, and not followed yet.
+        next_id: tracks with lower ids, which the start message did not name, are no more.
+        begun: tracks that began at a center whose start message has not come yet.
         ready: worked out ahead for the next scan, or None. It saves time and changes nothing.
     """
 
@@ -117,6 +124,8 @@ class State(NamedTuple):
     advice: tuple[Advice, ...] = ()
     lineage: int = 0
     rebases: tuple[Rebase, ...] = ()
+    next_id: int = 0
+    begun: tuple[Begin, ...] = ()
     ready: Ready | None = None
 
 
@@ -142,7 +151,11 @@ class LocalTracker:
         sensors: models of all sensors of the network.
         number: of this sensor among them.
         filter: predicts and filters the tracks.
-        feedback: the fused track comes back, as advice or to begin anew (theory.md §3, 6).
+        feedback: the center answers every measurement time: with the fused tracks, as advice or to begin anew
+            (theory.md §3, 6), or with those that begin (§8).
+        advised: that answer is advice or to begin anew.
+        joint: tracks that share plots are associated jointly (Eq. 21).
+        claimed: a plot that belongs to the tracks with at least this probability starts none; None: none does.
         rounded: reports are in single precision.
         selection: which plots are sent, where the center tracks; else None.
         digest: of what the center must have in common with this node.
@@ -156,6 +169,9 @@ class LocalTracker:
     number: int
     filter: LocalFilter
     feedback: bool
+    advised: bool
+    joint: bool
+    claimed: float | None
     rounded: bool
     selection: Selection | None
     digest: str
@@ -182,7 +198,10 @@ class LocalTracker:
             sensors=sensors,
             number=number,
             filter=LocalFilter.of(scenario),
-            feedback=scenario.fusion.feedback != "none",
+            feedback=scenario.fusion.feedback != "none" or scenario.initiation is not None,
+            advised=scenario.fusion.feedback != "none",
+            joint=scenario.joint,
+            claimed=None if scenario.initiation is None or config.kind == "bearing" else scenario.initiation.claimed,
             rounded=scenario.fusion.precision == "float32",
             selection=scenario.fusion.selection.build() if scenario.fusion.mode == "selected" else None,
             digest=scenario.digest,
@@ -210,19 +229,34 @@ class LocalTracker:
         """``scan``, for plots that may be of every track its own."""
         state = self._rebased(state, look.time_ns)
         ready = self._ready(state, look.time_ns, look.position)
-        mixture = self._filtered(self.filter, ready.mixture, ready.expected, look)
+        mixture, free = self._filtered(self.filter, ready.mixture, ready.expected, look, ready.predicted.log_odds)
         filtered = self._with(ready.predicted, mixture)
+        look, unclaimed = self._unclaimed(look, free)
+        if self.rounded:
+            unclaimed = unclaimed.astype(np.float32).astype(np.float64)
         tracks = filtered if ready.live.all() else _put(ready.advised, ready.live, filtered)
         advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
         kept = tuple(old for old in state.recent if old.time_ns >= look.time_ns - self.buffer_ns)
         if self.selection is None:
-            report: Report | Picked = self._report(state, look.time_ns, next_ns, filtered.ids, mixture)
+            report: Report | Picked = self._report(state, look, next_ns, filtered.ids, mixture, unclaimed)
         else:
-            report = self._picked(state, look, next_ns, ready, self.selection)
+            report = self._picked(state, look, next_ns, ready, self.selection, unclaimed)
         sequence, recent = state.sequence + 1, (*kept, look)
         return state._replace(sequence=sequence, tracks=tracks, recent=recent, advice=advice, ready=None), report
 
-    def _picked(self, state: State, look: Look, next_ns: int, ready: Ready, selection: Selection) -> Picked:
+    def _unclaimed(self, look: Look, free: Array | None) -> tuple[Look, Array]:
+        """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""
+        z = look.plots.z
+        if self.claimed is None or z.ndim > 2:
+            return look, np.empty((0, z.shape[-1]))
+        if free is None:
+            return look, z
+        with np.errstate(divide="ignore"):  # surely claimed
+            return look._replace(log_free=np.log(free)), z[free > 1.0 - self.claimed]
+
+    def _picked(
+        self, state: State, look: Look, next_ns: int, ready: Ready, selection: Selection, unclaimed: Array
+    ) -> Picked:
         plots = look.plots
         mine = select(ready.mixture.log_w, ready.expected, plots, selection)
         track, plot = np.nonzero(mine)
@@ -245,9 +279,12 @@ class LocalTracker:
             plots=mine.sum(axis=-1),
             which=which,
             z=z,
+            unclaimed=unclaimed,
         )
 
-    def _report(self, state: State, time_ns: int, next_ns: int, ids: IntArray, filtered: Mixture) -> Report:
+    def _report(
+        self, state: State, look: Look, next_ns: int, ids: IntArray, filtered: Mixture, unclaimed: Array
+    ) -> Report:
         mixture = self.filter.report(filtered)
         there = mixture.log_w > -np.inf
         x, P = (array[0][there] for array in mixture.density)
@@ -256,7 +293,7 @@ class LocalTracker:
         return Report(
             sensor=self.config.name,
             sequence=state.sequence,
-            time_ns=time_ns,
+            time_ns=look.time_ns,
             next_ns=next_ns,
             epoch=state.lineage or state.epoch,
             ids=ids,
@@ -264,13 +301,47 @@ class LocalTracker:
             log_g=mixture.log_g[there],
             x=x,
             P=P,
+            position=look.position if self.claimed is not None else np.empty(0),
+            unclaimed=unclaimed,
         )
+
+    def told(self, state: State, message: Start | Begin | Stop | Advice | Rebase) -> State:
+        """Follow what the center says."""
+        match message:
+            case Start():
+                return self.start(state, message)
+            case Begin():
+                return self.begin(state, message)
+            case Stop():
+                return self.stop(state, message)
+            case Advice():
+                return self.advise(state, message)
+            case Rebase():
+                return self.rebase(state, message)
 
     def start(self, state: State, start: Start) -> State:
         """Take over tracks, and catch up on the scans since their start; a higher epoch names all tracks there are."""
         if start.epoch > state.epoch:
             state = state._replace(epoch=start.epoch, tracks=self.initial().tracks, lineage=0, rebases=())
-        return self._taken_over(state, take(self._fresh(start), ~np.isin(start.ids, state.tracks.ids)))
+        state = state._replace(next_id=start.next_id)
+        state = self._taken_over(state, take(self._fresh(start), ~np.isin(start.ids, state.tracks.ids)))
+        begun, state = state.begun, state._replace(begun=())
+        for begin in begun:
+            state = self.begin(state, begin)
+        return state
+
+    def begin(self, state: State, begin: Begin) -> State:
+        """Keep tracks that begin, and catch up on the scans since; what the start message knew it has told."""
+        if state.epoch <= begin.epoch:
+            return state._replace(begun=(*state.begun, begin))
+        factor, zero = self.filter.share.start(Gaussian(begin.x, begin.P)), np.zeros(len(begin.ids))
+        start = Start("", state.epoch, begin.ids, begin.times_ns, zero, *factor, begin.x, begin.P)
+        new = (begin.ids >= state.next_id) & ~np.isin(begin.ids, state.tracks.ids)
+        over = np.isin(state.tracks.ids, begin.ended)
+        if over.any():
+            log_odds = np.where(over, -np.inf, state.tracks.log_odds)
+            state = state._replace(tracks=state.tracks._replace(log_odds=log_odds))
+        return self._taken_over(state, take(self._fresh(start), new), alone=False)
 
     def rebase(self, state: State, rebase: Rebase) -> State:
         """Keep a rebase for the first scan that it holds for."""
@@ -290,14 +361,14 @@ class LocalTracker:
         state = state._replace(tracks=take(mine, ~np.isin(mine.ids, told.ids)), lineage=told.epoch, rebases=later)
         return self._taken_over(state, fresh)
 
-    def _taken_over(self, state: State, fresh: Tracks) -> State:
-        """The state with new tracks, which have seen the scans that are kept."""
-        for look in state.recent:
+    def _taken_over(self, state: State, fresh: Tracks, *, alone: bool = True) -> State:
+        """The state with new tracks, which have seen the scans that are kept; if not alone, what the others left."""
+        for look in state.recent if alone else map(_left, state.recent):
             due = fresh.times_ns < look.time_ns
             if due.any():
                 predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position)
-                filtered = self._with(predicted, self._filtered(self.filter, mixture, expected, look))
-                fresh = _put(fresh, due, filtered)
+                mixture, _ = self._filtered(self.filter, mixture, expected, look, predicted.log_odds)
+                fresh = _put(fresh, due, self._with(predicted, mixture))
         tracks = concatenate(*_alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
         return state._replace(tracks=tracks)
@@ -342,7 +413,8 @@ class LocalTracker:
                 prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
                 predicted = honest.predict(prior, _interval(times[due], look.time_ns))
                 expected = self._seen(honest, predicted, look.position)
-                log_w[due], _, ((x_a[due],), (P_a[due],)) = self._filtered(honest, predicted, expected, look)
+                filtered, _ = self._filtered(honest, predicted, expected, look, tracks.log_odds[due])
+                log_w[due], _, ((x_a[due],), (P_a[due],)) = filtered
                 times[due] = look.time_ns
         return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times)
 
@@ -352,7 +424,10 @@ class LocalTracker:
         both = Gaussian(np.stack([start.x, start.x_a]), np.stack([start.P, start.P_a]))
         log_w, log_g, (x, P) = self.filter.spread(both, start.log_p_bar)
         network_P = np.repeat(start.P[:, None], network, axis=1)
-        return Tracks(start.ids, start.times_ns, log_w, log_g, x[0], P[0], start.times_ns, x[1], P[1], network_P)
+        log_odds = np.zeros(len(start.ids))
+        return Tracks(
+            start.ids, start.times_ns, log_w, log_g, x[0], P[0], start.times_ns, x[1], P[1], log_odds, network_P
+        )
 
     def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Mixture, Expected]:
         """Predict to a time, and what the sensor will see from a position then."""
@@ -364,8 +439,17 @@ class LocalTracker:
     def _seen(self, local: LocalFilter, predicted: Mixture, position: Array) -> Expected:
         return local.expect(predicted.density, self.sensor, position, self.config.view_center(position))
 
-    def _filtered(self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look) -> Mixture:
-        return local.update(predicted, expected, look.plots, self.sensor, look.position)
+    def _filtered(
+        self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
+    ) -> tuple[Mixture, Array | None]:
+        """Tracks after a scan, and the probability of each plot to be that of none; None: not asked for."""
+        near, free = local.near(expected, look.plots, self.sensor, look.position), None
+        wanted = self.claimed is not None or (self.joint and len(log_odds) > 1)
+        if wanted and look.plots.z.ndim == 2:
+            plots, existence = len(look.plots.z), expit(log_odds)
+            shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
+            near = shared if self.joint else near
+        return local.update(predicted, expected, near, self.sensor, look.position), free
 
     def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
         mixture = self._mixture(tracks)
@@ -407,7 +491,25 @@ class LocalTracker:
     def _with(self, tracks: Tracks, mixture: Mixture) -> Tracks:
         """Tracks with other densities; where the factor associates for itself it is both filters."""
         x, P = mixture.density
-        return tracks._replace(log_w=mixture.log_w, log_g=mixture.log_g, x=x[0], P=P[0], x_a=x[-1], P_a=P[-1])
+        with np.errstate(invalid="ignore"):  # what was impossible stays so
+            gain = log_sum_exp(mixture.log_g) - log_sum_exp(tracks.log_g)
+        log_odds = tracks.log_odds + np.where(np.isnan(gain), 0.0, gain)
+        # What has ended stays so.
+        log_odds = np.where(tracks.log_odds == -np.inf, -np.inf, np.clip(log_odds, -SUREST, SUREST))
+        return tracks._replace(
+            log_w=mixture.log_w,
+            log_g=mixture.log_g,
+            x=x[0],
+            P=P[0],
+            x_a=x[-1],
+            P_a=P[-1],
+            log_odds=log_odds,
+        )
+
+
+def _left(look: Look) -> Look:
+    """A scan for tracks that begin later: false plots are the denser, the more the others claim them."""
+    return look if look.log_free is None else look._replace(plots=look.plots._replace(log_relative=-look.log_free))
 
 
 def _put(tracks: Tracks, rows: BoolArray, part: Tracks) -> Tracks:

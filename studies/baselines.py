@@ -48,7 +48,8 @@ class _Solo:
         self.predict(look.time_ns)
         center = config.view_center(look.stand)
         expected = self._filter.expect(self.mixture.density, sensor, look.stand, center)
-        self.mixture = self._filter.update(self.mixture, expected, own(look.plots), sensor, look.stand)
+        near = self._filter.near(expected, own(look.plots), sensor, look.stand)
+        self.mixture = self._filter.update(self.mixture, expected, near, sensor, look.stand)
 
     def predict(self, time_ns: int) -> None:
         """Go on to a time."""

@@ -29,6 +29,7 @@ _COMPUTING = ("common", "fusion_center", "scenarios", "sensor_node", "studies")
 _SHOWING = {
     "calibration",
     "cli",
+    "evaluate",
     "figures",
     "importance",
     "lines",
@@ -151,6 +152,8 @@ def check(scenario: Scenario, order: Order, known: Sequence[str]) -> None:
 def _scenario_faults(scenario: Scenario) -> Iterator[str]:
     if scenario.simulation is None:
         yield f"{scenario.name}: has no [simulation]; a study draws its worlds, give a duration"
+    elif scenario.simulation.truth is not None:
+        yield f"{scenario.name}: simulation.truth: a study draws its targets, recorded ones are the same in every world"
     if not scenario.hypotheses:
         yield f"{scenario.name}: has no [[hypothesis]]; a study follows the track of hypothesis 0"
     elif scenario.simulation is not None:
@@ -206,7 +209,11 @@ def program_digest() -> str:
 
 
 def _only_shows(file: Path) -> bool:
-    return file.parent.name == "studies" and (file.stem in _SHOWING or file.stem.startswith("report"))
+    here = Path(__file__).parent
+    if not file.is_relative_to(here):
+        return False
+    name = Path(file.relative_to(here).parts[0]).stem
+    return name in _SHOWING or name.startswith("report")
 
 
 def _digest(text: str) -> str:

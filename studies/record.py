@@ -96,9 +96,12 @@ class Record:
         """Decisions and outcome as JSON."""
         limits = self.scenario.decision.thresholds
         decisions = [decision_entry(decision, self.scenario) for decision in self.standing()]
+        times = [self.scenario.to_seconds(time_ns) for time_ns in self.pictures]
         return {
             "scenario": self.scenario.name,
             **extra,
+            "first_time": min(times, default=None),
+            "last_time": max(times, default=None),
             "thresholds": {"log_a": limits.log_a, "log_b": limits.log_b},
             "tracks": [
                 {

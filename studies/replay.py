@@ -5,7 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from common.config import Scenario
-from common.messages import NEVER, Advice, Decision, Join, Message, Picked, Rebase, Report, Scan, Start, Stop, Tracks
+from common.messages import (
+    NEVER,
+    Advice,
+    Begin,
+    Decision,
+    Join,
+    Message,
+    Picked,
+    Rebase,
+    Report,
+    Scan,
+    Start,
+    Stop,
+    Tracks,
+)
 from fusion_center.center import Center
 from sensor_node.sources import schedule_of
 from sensor_node.tracker import LocalTracker
@@ -50,16 +64,11 @@ class Replay:
     def _tell_nodes(self, message: Message) -> None:
         nodes, trackers = self._nodes, self._trackers
         match message:
-            case Start(sensor=name):
-                nodes[name] = trackers[name].start(nodes[name], message)
-            case Stop(sensor=name):
-                nodes[name] = trackers[name].stop(nodes[name], message)
-            case Advice():
+            case Start(sensor=name) | Stop(sensor=name):
+                nodes[name] = trackers[name].told(nodes[name], message)
+            case Begin() | Advice() | Rebase():
                 for name, tracker in trackers.items():
-                    nodes[name] = tracker.advise(nodes[name], message)
-            case Rebase():
-                for name, tracker in trackers.items():
-                    nodes[name] = tracker.rebase(nodes[name], message)
+                    nodes[name] = tracker.told(nodes[name], message)
             case _:
                 pass
 

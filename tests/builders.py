@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from common.config import Scenario
-from common.messages import NEVER, Clock, Decision, Join, Message, Report, Scan, Start, Tracks
+from common.messages import NEVER, Begin, Clock, Decision, Join, Message, Report, Scan, Start, Stop, Tracks
 from common.quantities import NS_PER_S
 from fusion_center.center import Center
 from fusion_center.state import Event, Tick
@@ -165,7 +165,11 @@ class Node:
 
     def start(self, start: Start) -> None:
         """Take over tracks."""
-        self.state = self.tracker.start(self.state, start)
+        self.told(start)
+
+    def told(self, message: Start | Begin | Stop) -> None:
+        """The center says something."""
+        self.state = self.tracker.told(self.state, message)
 
     def scan(self, scan: Scan, next_ns: int = NEVER) -> Report:
         """Filter a scan."""

@@ -1,15 +1,27 @@
-"""The converter of the recorded ferry: the format traps of its source, on a dataset of three scans."""
+"""The recorded ferry: the format traps of its source on a dataset of three scans, and how its sensors are measured."""
 
 from __future__ import annotations
 
 import json
+import math
+import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from scenarios.autoferry.convert import main
+from common.config import load_scenario
+from common.messages import Tracks
+from scenarios import catalogue
+from scenarios.autoferry import measure
+from scenarios.autoferry.convert import SCENARIOS, main
+from scenarios.truth import read_truth
+from sensor_node.sources import all_scans
+from studies.replay import Replay
 
+FOLDER = catalogue.FOLDER / "autoferry"
 SHIP = [-16.0, -390.0]  # north, east
+SQUARE = {1: [10.0, 120.0], 2: [110.0, 20.0]}
 
 
 def dataset(folder: Path, *measurements: object, sensor: int = 2) -> Path:
@@ -64,3 +76,83 @@ def test_a_wrong_measurement_is_named_and_nothing_written(tmp_path: Path, capsys
     assert main([str(tmp_path), "--scenario", "7", "--out", str(tmp_path)]) == 1
     assert "scenario7_detections.json: entry 0: " in capsys.readouterr().err
     assert not (tmp_path / "scenario7.jsonl").exists()
+
+
+def test_bearings_come_in_three_forms(tmp_path: Path) -> None:
+    """A list, a bare number for one bearing, and an empty list for none: a miss, not a gap."""
+    scans = convert(dataset(tmp_path, [0.4212120053, -2.1709064241], -2.2054613959, [], sensor=4))
+    assert [scan["plots"] for scan in scans] == [[[0.42121], [-2.17091]], [[-2.20546]], []]
+    assert {scan["sensor"] for scan in scans} == {"daylight"}
+
+
+@pytest.mark.parametrize("measurement", [121.0, [0.1, "0.2"], [[0.1], [0.2]], None])
+def test_a_wrong_bearing_is_named(tmp_path: Path, measurement: object, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(dataset(tmp_path, measurement, sensor=3)), "--scenario", "7", "--out", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert "scenario7_detections.json: entry 0: measurement: " in said
+    assert "expected radians" in said
+
+
+@pytest.mark.skipif("WALDNET_DATA" not in os.environ, reason="WALDNET_DATA is the folder of the source data")
+def test_the_shipped_files_come_from_the_dataset(tmp_path: Path) -> None:
+    assert main([str(Path(os.environ["WALDNET_DATA"]) / "autoferry"), "--out", str(tmp_path)]) == 0
+    made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    assert made == {path.name: path.read_bytes() for path in FOLDER.glob("*.jsonl")}
+
+
+def test_the_tables_are_what_is_measured() -> None:
+    assert measure.tables(FOLDER) in (FOLDER / "README.md").read_text()
+
+
+def test_a_boat_is_measured_where_it_is(tmp_path: Path) -> None:
+    """Two boats 100 m away, north and east: the camera sees the eastern one, beside it and nothing."""
+    truth = [{"target": n, "time": t, "position": place} for n, place in SQUARE.items() for t in (0.0, 3.0)]
+    bearings = [[[1.58], [0.8]], [[1.60], [-3.0]], []]
+    scans = [
+        {"sensor": "daylight", "time": 1.0 + k, "position": [10.0, 20.0], "plots": plots}
+        for k, plots in enumerate(bearings)
+    ]
+    for name, lines in (("scenario7-truth.jsonl", truth), ("scenario7.jsonl", scans)):
+        (tmp_path / name).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    looks = measure.compare(tmp_path, 7, "daylight")
+    assert [look.false_plots for look in looks] == [1, 1, 0]
+    north, east = zip(*(look.boats for look in looks), strict=True)
+    assert [boat.error for boat in north] == [None] * 3
+    assert east[2].error is None
+    errors = [boat.error.item() for boat in east[:2] if boat.error is not None]
+    assert errors == pytest.approx([1.58 - math.pi / 2, 1.60 - math.pi / 2])
+    assert {boat.range for boat in (*north, *east)} == {100.0}
+
+
+def test_bearings_point_at_the_boats() -> None:
+    """Mirrored or turned, they would find the boats by chance only."""
+    found = [boat.error for look in measure.compare(FOLDER, 5, "daylight") for boat in look.boats if boat.number == 2]
+    errors = [float(error[0]) for error in found if error is not None]
+    assert len(errors) > 0.8 * len(found)
+    assert abs(sum(errors) / len(errors)) < 0.02
+
+
+@pytest.mark.parametrize("number", SCENARIOS)
+def test_all_four_sensors_are_there(number: int) -> None:
+    loaded = load_scenario(catalogue.find(f"autoferry-{number}-all"))
+    assert loaded.sensor_names == ("radar", "lidar", "infrared", "daylight")
+    assert {scan.sensor for scan in all_scans(loaded)} == set(loaded.sensor_names)
+
+
+@pytest.mark.parametrize("number", [2, 5])
+def test_in_open_water_the_network_finds_both_boats_itself(number: int) -> None:
+    """Within ten scans of the radar, 17 s, both are held by confirmed tracks at the same time."""
+    loaded = load_scenario(catalogue.find(f"autoferry-{number}-all"))
+    boats = read_truth(FOLDER / f"scenario{number}-truth.jsonl")
+    until_ns = loaded.to_ns(17.0)
+    scans = [scan for scan in all_scans(loaded) if scan.time_ns <= until_ns]
+    held = set()
+    for picture in Replay(loaded, scans).run():
+        if isinstance(picture, Tracks):
+            confirmed, time_s = picture.x[picture.status == 1, :2], loaded.to_seconds(picture.time_ns)
+            there = [
+                [np.interp(time_s, boat.times_s, boat.positions[:, axis]) for axis in (0, 1)] for boat in boats.values()
+            ]
+            near = np.linalg.norm(confirmed[:, None] - np.array(there), axis=-1) < 30.0
+            held.add(int(near.any(axis=0).sum()))
+    assert max(held) == 2

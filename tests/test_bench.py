@@ -20,7 +20,7 @@ from benchmarks.namespaces import Namespaces
 from benchmarks.precision import compare
 from benchmarks.traffic import messages
 from benchmarks.worlds import World
-from common.messages import Proposal, Report, Scan
+from common.messages import Report, Scan
 from sensor_node.sources import all_scans
 from studies.network import run_in_memory
 from studies.replay import Replay
@@ -51,13 +51,14 @@ def test_what_is_sent_is_what_nodes_send() -> None:
     assert len(reports) == len(proposals) == len(plots) == SMALL.scans
     for report, proposal, scan in zip(reports, proposals, plots, strict=True):
         assert isinstance(report, Report)
-        assert isinstance(proposal, Proposal)
+        assert isinstance(proposal, Report)
         assert isinstance(scan, Scan)
         assert report.time_ns == proposal.time_ns == scan.time_ns
         assert len(report.ids) == SMALL.tracks
-        assert len(proposal.x) < len(scan.z)
-    assert sum(len(message.x) for message in proposals if isinstance(message, Proposal)) > 0
-    assert any((one.x != two.x).any() for one, two in pairwise(reports) if isinstance(one, Report | Proposal))
+        assert not len(proposal.ids)
+        assert {tuple(plot) for plot in proposal.unclaimed} < {tuple(plot) for plot in scan.z}
+    assert sum(len(message.unclaimed) for message in proposals if isinstance(message, Report)) > 0
+    assert any((one.x != two.x).any() for one, two in pairwise(reports) if isinstance(one, Report))
 
 
 def test_latency_has_its_parts(processes: Processes, tmp_path: Path) -> None:

@@ -10,18 +10,18 @@ from builders import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.codec import LAYOUTS, ROUNDED, VERSION, decode, encode
+from common.codec import LAYOUTS, ROUNDED, ROUNDED_PLOTS, VERSION, decode, encode
 from common.errors import DecodeError, VersionError
 from common.messages import (
     NEVER,
     Advice,
+    Begin,
     Clock,
     Decision,
     Join,
     Keys,
     Message,
     Picked,
-    Proposal,
     Rebase,
     Report,
     Scan,
@@ -62,6 +62,12 @@ def report(tracks: int, n: int = 4, terms: int = 1) -> Report:
     )
 
 
+def with_unclaimed(message: Any, plots: int, m: int = 2, d: int = 2) -> Any:
+    """A report or picked plots with plots that no track claims."""
+    rng = np.random.default_rng(plots)
+    return message._replace(position=rng.standard_normal(d), unclaimed=rng.standard_normal((plots, m)))
+
+
 def start(tracks: int, n: int = 4) -> Start:
     rng = np.random.default_rng(tracks)
     return Start(
@@ -74,6 +80,20 @@ def start(tracks: int, n: int = 4) -> Start:
         P=covariances(rng, tracks, n),
         x_a=rng.standard_normal((tracks, n)),
         P_a=covariances(rng, tracks, n),
+        next_id=3 * tracks + 1,
+    )
+
+
+def begin(tracks: int, n: int = 4, ended: int = 2) -> Begin:
+    rng = np.random.default_rng(tracks)
+    return Begin(
+        epoch=3,
+        given_ns=EPOCH_NS,
+        ids=ids(tracks),
+        times_ns=EPOCH_NS - np.arange(tracks),
+        x=rng.standard_normal((tracks, n)),
+        P=covariances(rng, tracks, n),
+        ended=ids(ended) + 1,
     )
 
 
@@ -108,11 +128,6 @@ def scan(plots: int, d: int = 2) -> Scan:
     return Scan("radar-1", EPOCH_NS, rng.standard_normal(d), rng.standard_normal((plots, d)))
 
 
-def proposal(tracks: int, n: int = 4) -> Proposal:
-    rng = np.random.default_rng(tracks)
-    return Proposal("radar-1", EPOCH_NS, rng.standard_normal((tracks, n)), covariances(rng, tracks, n))
-
-
 def picked(tracks: int, plots: int, m: int = 2) -> Picked:
     """Plot i goes to every track whose number is no multiple of i + 2."""
     rng = np.random.default_rng(tracks)
@@ -127,14 +142,15 @@ def picked(tracks: int, plots: int, m: int = 2) -> Picked:
         ids=ids(tracks),
         plots=np.array([len(own) for own in which], np.int64),
         which=np.concatenate([np.empty(0, np.int64), *which]),
-        z=rng.standard_normal((plots, m)).astype(np.float32).astype(np.float64),
+        z=rng.standard_normal((plots, m)),
+        unclaimed=np.empty((0, m)),
     )
 
 
-def rounded(message: Report) -> Report:
-    """A report whose densities fit into single precision."""
-    x, P = (array.astype(np.float32).astype(np.float64) for array in (message.x, message.P))
-    return message._replace(x=x, P=P)
+def rounded(message: Any) -> Any:
+    """A report whose densities and plots fit into single precision."""
+    names = {"x", "P", "z", "unclaimed"} & set(message._fields)
+    return message._replace(**{name: getattr(message, name).astype("f4").astype("f8") for name in names})
 
 
 MESSAGES: dict[str, Message] = {
@@ -144,17 +160,28 @@ MESSAGES: dict[str, Message] = {
     "report-mixed-terms": report(1, terms=6)._replace(ids=ids(3), terms=np.array([1, 2, 3])),
     "report-impossible": report(2)._replace(log_g=np.array([-np.inf, -1.0])),
     "report-last": report(1)._replace(next_ns=NEVER),
+    **{f"report-unclaimed-{u}": with_unclaimed(report(1), u) for u in (0, 1, 100)},
+    **{f"report-unclaimed-of-{m}": with_unclaimed(report(1), 2, m) for m in (1, 2, 3, 4)},
+    "report-unclaimed-only": with_unclaimed(report(0), 2),
+    "report-unclaimed-3d": with_unclaimed(report(2, n=6), 2, m=3, d=3),
     **{f"picked-{t}-{m}": picked(t, m) for t, m in ((0, 0), (1, 0), (1, 3), (100, 7))},
     "picked-3d": picked(3, 4, m=3),
+    **{f"picked-unclaimed-{u}": with_unclaimed(picked(1, 3), u) for u in (0, 1, 100)},
+    **{f"picked-unclaimed-of-{m}": with_unclaimed(picked(1, 3, m), 2, m) for m in (1, 2, 3, 4)},
+    "picked-unclaimed-only": with_unclaimed(picked(0, 0), 2),
+    "picked-unclaimed-3d": with_unclaimed(picked(2, 3, m=3), 2, m=3, d=3),
     **{f"scan-{m}": scan(m) for m in (0, 1, 100)},
     "scan-3d": scan(2, d=3),
-    **{f"proposal-{t}": proposal(t) for t in (0, 1, 100)},
-    "proposal-3d": proposal(2, n=6),
     "join": Join("radar-1", 2**63 - 1, EPOCH_NS, "0123456789abcdef"),
     "join-never": Join("radar-1", 0, NEVER, ""),
     **{f"start-{t}": start(t) for t in (0, 1, 100)},
     "start-3d": start(2, n=6),
+    "start-last-of-all": start(1)._replace(next_id=NEVER),
     "start-impossible": start(1)._replace(log_p_bar=np.array([-np.inf])),
+    **{f"begin-{t}": begin(t) for t in (0, 1, 100)},
+    **{f"begin-ended-{e}": begin(1, ended=e) for e in (0, 1, 100)},
+    "begin-nothing": begin(0, ended=0),
+    "begin-3d": begin(2, n=6),
     **{f"stop-{t}": Stop("radar-1", ids(t)) for t in (0, 1, 100)},
     **{f"advice-{t}": advice(t) for t in (0, 1, 100)},
     "advice-3d": advice(2, n=6),
@@ -167,6 +194,7 @@ MESSAGES: dict[str, Message] = {
     "tracks-one-sensor": picture(2, sensors=1),
     "decision-confirmed": Decision("confirmed", 4, EPOCH_NS, 9.5, 11.0, 12),
     "decision-deleted": Decision("deleted", 4, EPOCH_NS, -np.inf, -np.inf, 1),
+    "decision-merged": Decision("merged", 7, EPOCH_NS, 1.5, 1.5, 6, into=4),
     "decision-withdrawn": Decision("withdrawn", 4, EPOCH_NS, -3.5, -3.5, 2),
 }
 each_message = pytest.mark.parametrize("message", MESSAGES.values(), ids=MESSAGES.keys())
@@ -242,6 +270,30 @@ GOLDEN_START = Start(
     P=np.array([[[4.0, 1.0], [1.0, 3.0]]]),
     x_a=np.array([[3.0, 4.0]]),
     P_a=np.array([[[2.0, 0.0], [0.0, 2.0]]]),
+    next_id=9,
+)
+GOLDEN_UNCLAIMED = GOLDEN_REPORT._replace(position=np.array([5.0, 0.0]), unclaimed=np.array([[0.5, -2.0]]))
+GOLDEN_PICKED = Picked(
+    sensor="a",
+    sequence=3,
+    time_ns=10,
+    next_ns=12,
+    epoch=2,
+    position=np.array([5.0, 0.0]),
+    ids=np.array([7]),
+    plots=np.array([1]),
+    which=np.array([0]),
+    z=np.array([[1.0, 2.0]]),
+    unclaimed=np.array([[0.5, -2.0]]),
+)
+GOLDEN_BEGIN = Begin(
+    epoch=2,
+    given_ns=12,
+    ids=np.array([7]),
+    times_ns=np.array([258]),
+    x=np.array([[1.0, 2.0]]),
+    P=np.array([[[4.0, 1.0], [1.0, 3.0]]]),
+    ended=np.array([5, 6]),
 )
 GOLDEN_ADVICE = Advice(
     given_ns=12,
@@ -253,52 +305,98 @@ GOLDEN_ADVICE = Advice(
 GOLDEN = [
     (
         GOLDEN_REPORT,
-        "95 02 01"  # version, kind
+        "95 03 01"  # version, kind
         "94 03 0a cf7fffffffffffffff 02"  # sequence, time, next, epoch
-        "93 01 01 02"  # T, N, n
+        "96 01 01 02 00 00 00"  # T, N, n, d, U, m
         "c4 35 07000000 01"  # bin; ids, terms
         "000000000000e0bf"  # log_g
         "000000000000f03f 0000000000000040"  # x
         "0000000000001040 000000000000f03f 0000000000000840",  # upper triangle of P
     ),
     (
+        GOLDEN_UNCLAIMED,
+        "95 03 01 94 03 0a cf7fffffffffffffff 02"  # as before
+        "96 01 01 02 02 01 02"  # T, N, n, d, U, m
+        "c4 55 07000000 01 000000000000e0bf 000000000000f03f 0000000000000040"
+        "0000000000001040 000000000000f03f 0000000000000840"
+        "0000000000001440 0000000000000000"  # position
+        "000000000000e03f 00000000000000c0",  # unclaimed
+    ),
+    (
+        GOLDEN_PICKED,
+        "95 03 0d 94 03 0a 0c 02"  # version, kind, sequence, time, next, epoch
+        "96 01 01 01 02 02 01"  # T, N, M, m, d, U
+        "c4 38 07000000 0100 0000"  # bin; ids, plots, which
+        "000000000000f03f 0000000000000040"  # z
+        "0000000000001440 0000000000000000"  # position
+        "000000000000e03f 00000000000000c0",  # unclaimed
+    ),
+    (
         GOLDEN_START,
-        "95 02 04 91 02 92 01 02"  # version, kind, epoch, T, n
+        "95 03 04 92 02 09 92 01 02"  # version, kind, epoch, next id, T, n
         "c4 64 07000000 0201000000000000"  # bin; ids, times
         "000000000000e0bf"  # log_p_bar
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840"  # x, P
         "0000000000000840 0000000000001040 0000000000000040 0000000000000000 0000000000000040",  # x_a, P_a
     ),
     (
+        GOLDEN_BEGIN,
+        "95 03 0b 92 02 0c 93 01 02 02"  # version, kind, epoch, given, T, n, E
+        "c4 3c 07000000 0201000000000000"  # bin; ids, times
+        "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840"  # x, P
+        "05000000 06000000",  # ended
+    ),
+    (
         GOLDEN_ADVICE,
-        "95 02 06 92 0c 0a 92 01 02"  # version, kind, given, time, T, n
+        "95 03 06 92 0c 0a 92 01 02"  # version, kind, given, time, T, n
         "c4 2c 07000000"  # bin; ids
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840",  # x, P
     ),
     (
         Rebase(5, *GOLDEN_ADVICE),
-        "95 02 0c 93 05 0c 0a 92 01 02"  # version, kind, epoch, given, time, T, n
+        "95 03 0c 93 05 0c 0a 92 01 02"  # version, kind, epoch, given, time, T, n
         "c4 2c 07000000"  # bin; ids
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840",  # x, P
+    ),
+    (
+        Decision("merged", 7, 10, 0.5, 2.0, 12, into=4),
+        "95 03 09 97 a66d6572676564 07 0a"  # version, kind, what, track, time
+        "cb3fe0000000000000 cb4000000000000000 0c 04 90 c400",  # log_lr, log_lr_total, scans, into
     ),
 ]
 
 
-GOLDEN_ROUNDED = (
-    "95 02 0a 94 03 0a cf7fffffffffffffff 02 93 01 01 02"
-    "c4 21 07000000 01 000000000000e0bf"  # log_g in full
-    "0000803f 00000040 00008040 0000803f 00004040"  # x, P
-)
+GOLDEN_ROUNDED = [
+    (
+        GOLDEN_UNCLAIMED,
+        "95 03 0a 94 03 0a cf7fffffffffffffff 02 96 01 01 02 02 01 02"
+        "c4 39 07000000 01 000000000000e0bf"  # log_g in full
+        "0000803f 00000040 00008040 0000803f 00004040"  # x, P
+        "0000000000001440 0000000000000000"  # position in full
+        "0000003f 000000c0",  # unclaimed
+    ),
+    (
+        GOLDEN_PICKED,
+        "95 03 0e 94 03 0a 0c 02 96 01 01 01 02 02 01"
+        "c4 28 07000000 0100 0000 0000803f 00000040"  # z
+        "0000000000001440 0000000000000000"  # position in full
+        "0000003f 000000c0",  # unclaimed
+    ),
+]
 
 
-def test_the_bytes_of_a_rounded_report_never_change() -> None:
-    payload = bytes.fromhex(GOLDEN_ROUNDED)
-    assert encode(GOLDEN_REPORT, rounded=True) == payload
-    assert same(decode(KEYS.of(GOLDEN_REPORT), payload), GOLDEN_REPORT)
+@pytest.mark.parametrize(("message", "golden"), GOLDEN_ROUNDED, ids=["report", "picked"])
+def test_the_bytes_of_a_rounded_report_never_change(message: Message, golden: str) -> None:
+    payload = bytes.fromhex(golden)
+    assert encode(message, rounded=True) == payload
+    assert same(decode(KEYS.of(message), payload), message)
 
 
-@pytest.mark.parametrize(("message", "golden"), GOLDEN, ids=["report", "start", "advice", "rebase"])
-def test_the_bytes_of_version_2_never_change(message: Message, golden: str) -> None:
+GOLDEN_NAMES = ["report", "unclaimed", "picked", "start", "begin", "advice", "rebase", "merged"]
+
+
+@pytest.mark.parametrize(("message", "golden"), GOLDEN, ids=GOLDEN_NAMES)
+def test_the_bytes_of_version_3_never_change(message: Message, golden: str) -> None:
     payload = bytes.fromhex(golden)
     assert encode(message) == payload
     assert same(decode(KEYS.of(message), payload), message)
@@ -311,7 +409,9 @@ BUDGETS = {
     "start": 245,
     "advice": 117,
     "rebase": 117,
-    "proposal": 113,
+    "begin": 125,
+    "report-unclaimed": 18,
+    "picked-unclaimed": 18,
     "scan": 17,
     "stop": 5,
 }
@@ -326,21 +426,57 @@ def test_a_rounded_report_keeps_its_budget() -> None:
     assert len(encode(report(100), rounded=True)) <= 70 * 100
 
 
+@pytest.mark.parametrize(
+    ("less", "more", "double", "single"),
+    [
+        (report(100), report(101), 125, 69),
+        (report(100, n=6), report(101, n=6), 229, 121),
+        (with_unclaimed(report(1), 50), with_unclaimed(report(1), 51), 16, 8),
+        (with_unclaimed(report(1), 50, m=3, d=3), with_unclaimed(report(1), 51, m=3, d=3), 24, 12),
+        (with_unclaimed(picked(1, 3), 50), with_unclaimed(picked(1, 3), 51), 16, 8),
+        (begin(100), begin(101), 124, 124),
+        (begin(2, ended=50), begin(2, ended=51), 4, 4),
+    ],
+)
+def test_one_more_takes_so_many_bytes(less: Message, more: Message, double: int, single: int) -> None:
+    assert len(encode(more)) - len(encode(less)) == double
+    assert len(encode(more, rounded=True)) - len(encode(less, rounded=True)) == single
+
+
 def test_small_messages_keep_their_budgets() -> None:
     assert len(encode(MESSAGES["clock"])) <= 45
     assert len(encode(MESSAGES["join"])) <= 45
     assert len(encode(MESSAGES["decision-confirmed"])) <= 50
 
 
-@pytest.mark.parametrize("message", [report(0), report(100), report(2, n=6), report(5, terms=3)])
-def test_a_rounded_report_keeps_its_evidence_and_what_fits(message: Report) -> None:
+REPORTS = {name: message for name, message in MESSAGES.items() if isinstance(message, Report | Picked)}
+
+
+@pytest.mark.parametrize("message", REPORTS.values(), ids=REPORTS.keys())
+def test_a_rounded_report_keeps_its_evidence_and_what_fits(message: Report | Picked) -> None:
     payload = encode(message, rounded=True)
-    assert msgpack.unpackb(payload)[1] == ROUNDED
+    assert msgpack.unpackb(payload)[1] == (ROUNDED if isinstance(message, Report) else ROUNDED_PLOTS)
     assert same(decode(KEYS.of(message), payload), rounded(message))
 
 
 def test_only_reports_are_rounded() -> None:
-    assert encode(start(3), rounded=True) == encode(start(3))
+    others = [message for name, message in MESSAGES.items() if name not in REPORTS]
+    assert all(encode(message, rounded=True) == encode(message) for message in others)
+
+
+UNLIKE = [
+    (report(2), "x", np.zeros((3, 4)), "x is not as long as others along N"),
+    (report(2), "P", np.zeros((2, 3, 3)), "P is not as long as others along n"),
+    (report(2), "terms", np.ones(1, np.int64), "terms is not as long as others along T"),
+    (picked(1, 3), "unclaimed", np.zeros((1, 3)), "unclaimed is not as long as others along m"),
+    (begin(2), "times_ns", np.zeros(1, np.int64), "times_ns is not as long as others along T"),
+]
+
+
+@pytest.mark.parametrize(("message", "name", "value", "fault"), UNLIKE)
+def test_arrays_along_one_axis_are_equally_long(message: Message, name: str, value: Any, fault: str) -> None:
+    with pytest.raises(AssertionError, match=fault):
+        encode(message._replace(**{name: value}))
 
 
 @pytest.mark.parametrize("version", [0, VERSION - 1, VERSION + 1, 7, -1, 2**64 - 1])
@@ -355,7 +491,7 @@ def test_another_version_is_refused_whatever_follows(version: int) -> None:
 
 
 @pytest.mark.parametrize(
-    "message", [report(1), scan(1), proposal(1), MESSAGES["join"], start(1), Stop("radar-1", ids(1))]
+    "message", [report(1), picked(1, 1), scan(1), MESSAGES["join"], start(1), Stop("radar-1", ids(1))]
 )
 def test_a_message_about_a_sensor_needs_a_key_with_one(message: Message) -> None:
     key = "waldnet/coast/center/tracks"
@@ -375,7 +511,16 @@ def floats(message: Message) -> list[str]:
 
 FLOATS = [
     (message, name)
-    for message in (report(1), scan(1), proposal(1), start(1), advice(1), rebase(1), picture(1))
+    for message in (
+        with_unclaimed(report(1), 1),
+        with_unclaimed(picked(1, 1), 1),
+        scan(1),
+        start(1),
+        begin(1),
+        advice(1),
+        rebase(1),
+        picture(1),
+    )
     for name in floats(message)
 ]
 FLOAT_NAMES = [f"{type(message).__name__}.{name}" for message, name in FLOATS]
@@ -390,11 +535,12 @@ def test_arrays_with_nan_or_infinity_are_refused(message: Message, name: str, va
     assert f"{name} has 1 values that are not finite" in refusal(payload, KEYS.of(message))
 
 
-@pytest.mark.parametrize("name", ["x", "P"])
+@pytest.mark.parametrize("name", ["x", "P", "position", "unclaimed"])
 def test_minus_infinity_is_only_for_logarithms(name: str) -> None:
-    bad = getattr(report(1), name).copy()
+    message = with_unclaimed(report(1), 1)
+    bad = getattr(message, name).copy()
     bad.flat[0] = -np.inf
-    assert "not finite" in refusal(encode(report(1)._replace(**{name: bad})))
+    assert "not finite" in refusal(encode(message._replace(**{name: bad})))
 
 
 SCALARS = [
@@ -425,15 +571,21 @@ ENVELOPES = [
     ("time as float", altered(GOLDEN_REPORT, scalars=[0, 1.0, 2, 1]), "time_ns is 1.0, expected a 64-bit integer"),
     ("epoch as truth", altered(GOLDEN_REPORT, scalars=[0, 1, 2, True]), "epoch is True, expected a 64-bit integer"),
     ("time too large", altered(GOLDEN_REPORT, scalars=[0, 2**63, 2, 1]), "time_ns is "),
-    ("sizes missing", altered(GOLDEN_REPORT, sizes=[1, 1]), "expected the sizes of the axes T, N, n"),
-    ("size negative", altered(GOLDEN_REPORT, sizes=[1, -1, 2]), "expected the sizes of the axes T, N, n"),
-    ("size as truth", altered(GOLDEN_REPORT, sizes=[True, 1, 2]), "expected the sizes of the axes T, N, n"),
+    ("sizes missing", altered(GOLDEN_REPORT, sizes=[1, 1, 2]), "expected the sizes of the axes T, N, n, d, U, m"),
+    ("size negative", altered(GOLDEN_REPORT, sizes=[1, -1, 2, 0, 0, 0]), "expected the sizes of the axes T, N, n"),
+    ("size as truth", altered(GOLDEN_REPORT, sizes=[True, 1, 2, 0, 0, 0]), "expected the sizes of the axes T, N, n"),
     ("sizes of a join", altered(MESSAGES["join"], sizes=[1]), "expected the sizes of the axes (none)"),
     ("blocks as text", altered(GOLDEN_REPORT, blocks="x" * 53), "blocks are a str, expected bin"),
     ("blocks too short", altered(GOLDEN_REPORT, blocks=BLOCKS[:-1]), "52 bytes of blocks, expected 53"),
     ("blocks too long", altered(GOLDEN_REPORT, blocks=BLOCKS + b"\0"), "54 bytes of blocks, expected 53"),
-    ("size forged", altered(GOLDEN_REPORT, sizes=[2**32, 1, 2]), "larger than the 53 bytes of blocks can hold"),
-    ("state forged", altered(GOLDEN_REPORT, sizes=[1, 1, 65]), "larger than the 53 bytes of blocks can hold"),
+    (
+        "size forged",
+        altered(GOLDEN_REPORT, sizes=[2**32, 1, 2, 0, 0, 0]),
+        "larger than the 53 bytes of blocks can hold",
+    ),
+    ("state forged", altered(GOLDEN_REPORT, sizes=[1, 1, 65, 0, 0, 0]), "larger than the 53 bytes of blocks can hold"),
+    ("unclaimed forged", altered(GOLDEN_REPORT, sizes=[1, 1, 2, 0, 2**40, 0]), "larger than the 53 bytes of blocks"),
+    ("unclaimed not sent", altered(GOLDEN_REPORT, sizes=[1, 1, 2, 2, 1, 2]), "53 bytes of blocks, expected 85"),
     ("ids descending", encode(report(2)._replace(ids=np.array([5, 4]))), "ids are not ascending"),
     ("ids repeated", encode(report(2)._replace(ids=np.array([5, 5]))), "ids are not ascending"),
     ("track without term", encode(report(2)._replace(terms=np.array([2, 0]))), "2 terms of tracks, 2 terms sent"),
@@ -454,8 +606,13 @@ def test_sensors_that_are_no_names_are_refused(sensors: Any) -> None:
     assert f"sensors is {sensors!r}, expected an array of texts" in refusal(payload, KEYS.tracks())
 
 
+def test_tracks_that_ended_ascend() -> None:
+    message = begin(1)._replace(ended=np.array([5, 5]))
+    assert "ended are not ascending" in refusal(encode(message), KEYS.of(message))
+
+
 def test_an_unknown_decision_is_refused() -> None:
-    scalars = ["perhaps", 4, EPOCH_NS, 1.0, 1.0, 1]
+    scalars = ["perhaps", 4, EPOCH_NS, 1.0, 1.0, 1, -1]
     assert "decision 'perhaps' is unknown" in refusal(altered(MESSAGES["decision-deleted"], scalars=scalars), "k")
 
 
@@ -507,7 +664,21 @@ def test_random_bytes(key: str, payload: bytes) -> None:
     survives(key, payload)
 
 
-TRUNCATED = ["report-1", "scan-1", "join", "start-1", "stop-1", "advice-1", "rebase-1", "clock", "tracks-1"]
+TRUNCATED = [
+    "report-1",
+    "report-unclaimed-1",
+    "picked-unclaimed-1",
+    "scan-1",
+    "join",
+    "start-1",
+    "begin-1",
+    "stop-1",
+    "advice-1",
+    "rebase-1",
+    "clock",
+    "tracks-1",
+    "decision-merged",
+]
 
 
 @pytest.mark.parametrize("name", TRUNCATED)
@@ -541,7 +712,7 @@ def test_random_bodies(key: str, kind: int, scalars: Any, sizes: Any, blocks: An
 
 
 @FUZZ
-@given(any_message, st.lists(size, max_size=5), st.none() | st.binary(max_size=200))
+@given(any_message, st.lists(size, max_size=7), st.none() | st.binary(max_size=200))
 def test_forged_sizes(message: Message, sizes: list[int], blocks: bytes | None) -> None:
     changes = {} if blocks is None else {"blocks": blocks}
     survives(KEYS.of(message), altered(message, sizes=sizes, **changes))
@@ -569,10 +740,10 @@ def test_every_message_has_its_key() -> None:
         "Report": "waldnet/coast/sensor/radar-1/report",
         "Picked": "waldnet/coast/sensor/radar-1/report",
         "Scan": "waldnet/coast/sensor/radar-1/plots",
-        "Proposal": "waldnet/coast/sensor/radar-1/proposal",
         "Join": "waldnet/coast/sensor/radar-1/join",
         "Start": "waldnet/coast/center/command/radar-1",
         "Stop": "waldnet/coast/center/command/radar-1",
+        "Begin": "waldnet/coast/center/advice",
         "Advice": "waldnet/coast/center/advice",
         "Rebase": "waldnet/coast/center/advice",
         "Clock": "waldnet/coast/center/clock",
@@ -597,13 +768,6 @@ def test_every_message_has_its_key() -> None:
 )
 def test_the_sensor_of_a_key(key: str, sensor: str) -> None:
     assert sensor_of(key) == sensor
-
-
-def test_picked_plots_are_rounded_on_request() -> None:
-    message = picked(3, 4)
-    payload = encode(message, rounded=True)
-    assert same(decode(KEYS.report("radar-1"), payload), message)  # they fit into single precision
-    assert len(encode(message)) - len(payload) == 4 * message.z.size
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from common.errors import ConfigError
 from common.estimation.association import Choice, kalman, nearest, normalise
 from common.estimation.field_of_view import Box, Disc, Everywhere
 from common.estimation.mixture import Reduction
+from common.initiation_config import InitiationConfig
 from scenarios import catalogue
 
 GOOD = """\
@@ -36,6 +37,16 @@ p0 = 1e-3
 p1 = 0.9
 enabled = true
 
+[initiation]
+plots = 2
+speed = 15.0
+max_speed = 40.0
+within = 4.0
+claimed = 0.4
+gate = 0.95
+merge = 0.0
+tentative = 200
+
 [fusion]
 mode = "federated"
 association = "tight"
@@ -44,6 +55,7 @@ filter = "pdaf"
 gate_probability = 1.0
 hold_back = 0.25
 window = 5.0
+joint = false
 
 [[sensor]]
 name = "radar-1"
@@ -126,6 +138,10 @@ def test_a_good_file_is_read(tmp_path: Path) -> None:
     assert (loaded.motion.dimensions, loaded.motion.psd) == (2, 10.0)
     assert (loaded.decision.p0, loaded.decision.p1, loaded.decision.enabled) == (1e-3, 0.9, True)
     assert (loaded.fusion.feedback, loaded.fusion.hold_back, loaded.fusion.window) == ("advice", 0.25, 5.0)
+    assert not loaded.fusion.joint
+    assert loaded.initiation == InitiationConfig(
+        plots=2, speed=15.0, max_speed=40.0, within=4.0, claimed=0.4, gate=0.95, merge=0.0, tentative=200
+    )
     assert loaded.sensor_names == ("radar-1", "radar-2", "radar-3")
     assert loaded.sensors[0].first_scan == 0.5
     assert loaded.simulation is not None
@@ -152,11 +168,21 @@ field_of_view = { shape = "disc", radius = 1 }
     assert (loaded.decision.p0, loaded.decision.p1, loaded.decision.enabled) == (1e-4, 0.95, True)
     fusion = loaded.fusion
     assert (fusion.mode, fusion.association, fusion.feedback, fusion.filter) == ("federated", "tight", "none", None)
-    assert (fusion.terms, fusion.feedback_delay) == (1, 0.0)
+    assert (fusion.terms, fusion.feedback_delay, fusion.joint, loaded.joint) == (1, 0.0, None, False)
     assert fusion.mixture.build() == Reduction(15, 1e-4, 0.5)
     assert (loaded.network.name, loaded.network.mode, loaded.network.multicast) == ("least", "peer", False)
     assert (loaded.sensors[0].scan_interval, loaded.sensors[0].first_scan) == (1.0, None)
     assert (loaded.simulation, loaded.recording, loaded.targets, loaded.hypotheses) == (None, None, (), ())
+    assert loaded.initiation is None
+
+
+def test_how_tracks_start_has_defaults(tmp_path: Path) -> None:
+    first, last = GOOD.index("[initiation]"), GOOD.index("[fusion]")
+    starts = load(tmp_path, f"{GOOD[:first]}[initiation]\nspeed = 20\n{GOOD[last:]}").initiation
+    assert starts is not None
+    assert (starts.plots, starts.within, starts.claimed, starts.gate) == (1, 5.0, 0.5, 0.99)
+    assert (starts.merge, starts.tentative, starts.fastest) == (0.5, 1000, 60.0)
+    assert starts.spread(6, 2).tolist() == [20.0, 20.0, 1.0, 1.0]
 
 
 def test_the_recording_is_beside_the_scenario(tmp_path: Path) -> None:
@@ -166,6 +192,14 @@ def test_the_recording_is_beside_the_scenario(tmp_path: Path) -> None:
     absolute = load(tmp_path, edited('"plots.jsonl"', '"/data/plots.jsonl"')).recording
     assert absolute is not None
     assert absolute.plots == Path("/data/plots.jsonl")
+
+
+def test_a_sensor_cannot_be_ignored_and_used(tmp_path: Path) -> None:
+    recording = load(tmp_path, edited('"plots.jsonl"', '"plots.jsonl"\nignore = ["camera"]')).recording
+    assert recording is not None
+    assert recording.ignore == ("camera",)
+    both = edited('"plots.jsonl"', '"plots.jsonl"\nignore = ["camera", "radar-2"]')
+    assert faults(tmp_path, both) == ["recording.ignore: 'radar-2' is a sensor of this scenario"]
 
 
 ADVICE_NEEDS = (
@@ -216,7 +250,24 @@ FAULTS = [
     ("p1 = 0.9", "p1 = 1.0", "decision.p1: 1 is not a probability strictly between 0 and 1"),
     ("p0 = 1e-3", "p0 = 0.9", "decision.p1: 0.9 is not above p0 = 0.9; no threshold lies between"),
     ("p1 = 0.9", "p1 = 1e-4", "decision.p1: 0.0001 is not above p0 = 0.001; no threshold lies between"),
+    # initiation
+    ("plots = 2", "plots = 3", "initiation.plots: 3 is not one of 1 or 2"),
+    ("plots = 2", "scans = 2", "initiation.scans: is no known key"),
+    ("speed = 15.0\n", "", "initiation.speed: is missing"),
+    ("speed = 15.0", "speed = 0", "initiation.speed: 0 is not positive and finite"),
+    ("speed = 15.0", "speed = 15.0\nacceleration = -1", "initiation.acceleration: -1 is not positive and finite"),
+    ("max_speed = 40.0", "max_speed = inf", "initiation.max_speed: inf is not positive and finite"),
+    ("within = 4.0", "within = 0", "initiation.within: 0 is not positive and finite"),
+    ("claimed = 0.4", "claimed = 1.5", "initiation.claimed: 1.5 is not a probability (0 to 1)"),
+    ("gate = 0.95", "gate = 0", "initiation.gate: 0 is not a probability above 0 (1 is no gate)"),
+    ("merge = 0.0", "merge = -0.5", "initiation.merge: -0.5 is not zero or positive and finite"),
+    ("tentative = 200", "tentative = -1", "initiation.tentative: got -1: input should be greater than or equal to 0"),
     # fusion
+    (
+        "joint = false",
+        'joint = "never"',
+        "fusion.joint: got 'never': input should be a valid boolean, unable to interpret input",
+    ),
     (
         'mode = "federated"',
         'mode = "best"',
@@ -420,10 +471,23 @@ def test_three_dimensions_need_longer_lists(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wrong", ["3", '"x"', "[3]", "[[3]]", "{ a = 1 }", "[{ a = 1 }]", "true"])
-@pytest.mark.parametrize("key", ["motion", "decision", "fusion", "network", "sensor", "target", "hypothesis"])
+@pytest.mark.parametrize(
+    "key", ["motion", "decision", "initiation", "fusion", "network", "sensor", "target", "hypothesis"]
+)
 def test_tables_of_another_kind_are_faults(tmp_path: Path, key: str, wrong: str) -> None:
     first = GOOD.index("[network]")
     assert any(line.startswith(key) for line in faults(tmp_path, f"{GOOD[:first]}{key} = {wrong}\n"))
+
+
+def test_tracks_start_only_where_a_sensor_tells_a_position(tmp_path: Path) -> None:
+    bearing = (
+        'kind = "bearing"\nsigma = [0.01]\np_d = 0.9\nfalse_plots = 1\nfield_of_view = { shape = "disc", radius = 1 }'
+    )
+    polar = bearing.replace("bearing", "polar").replace("[0.01]", "[1.0, 0.01]")
+    text = f'name = "x"\nmotion = {{ psd = 1.0 }}\ninitiation = {{ speed = 9.0 }}\n[[sensor]]\nname = "a"\n{bearing}\n'
+    fault = "initiation: no sensor tells a position, so that no track can start; all are of kind 'bearing'"
+    assert faults(tmp_path, text) == [fault]
+    assert load(tmp_path, f'{text}[[sensor]]\nname = "b"\n{polar}\n').initiation is not None
 
 
 def test_a_scenario_needs_sensors(tmp_path: Path) -> None:

@@ -13,12 +13,14 @@ import pytest
 from process_helpers import Processes
 
 from common.health import fault
+from scenarios.truth import read_truth
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 HOW_TO = (ROOT / "docs/how-to/first-network.md").read_text()
 STUDY = (ROOT / "docs/how-to/study.md").read_text()
 SENSORS = (ROOT / "docs/how-to/sensors.md").read_text()
+EVALUATE = (ROOT / "docs/how-to/evaluate.md").read_text()
 DEPLOY = (ROOT / "docs/how-to/deploy.md").read_text()
 WALDNET = str(Path(sys.executable).with_name("waldnet"))
 
@@ -156,6 +158,27 @@ def test_how_to_study(tmp_path: Path) -> None:
     assert len(shown) > 10
     unknown = {name for name in shown if name.rstrip("_") == name and not name.startswith("_")} - set(columns)
     assert unknown == {"lost_beyond"}
+
+
+@pytest.mark.processes
+def test_how_to_evaluate_a_recording(tmp_path: Path) -> None:
+    (tmp_path / "scenarios").symlink_to(ROOT / "scenarios")
+    (tmp_path / "shown.jsonl").write_text(blocks(EVALUATE, "json")[0])
+    steps = list(commands(section(EVALUATE, "A recorded")))
+    assert len(steps) == 2
+    *_, said = [run(words, tmp_path) for words in steps]
+    shown = [line.rstrip() for line in blocks(EVALUATE, "text")[0].splitlines()]
+    assert [line.rstrip() for line in said.splitlines()][: len(shown)] == shown
+    assert read_truth(tmp_path / "shown.jsonl")[1].times_s.tolist() == [0.16]
+
+
+@pytest.mark.processes
+def test_how_to_evaluate_simulations(tmp_path: Path) -> None:
+    steps = list(commands(section(EVALUATE, "Simulated")))
+    assert len(steps) == 4
+    for words in steps:
+        run(words, tmp_path)
+    assert (tmp_path / "four-radars/comparison.png").exists()
 
 
 def test_schema_is_the_one_the_program_prints() -> None:

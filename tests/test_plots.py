@@ -76,6 +76,17 @@ def test_scans_come_by_time_and_then_by_sensor(tmp_path: Path) -> None:
     assert all_same(in_order(reversed(scans), PLOT), scans)
 
 
+def test_sensors_of_a_recording_can_be_ignored(tmp_path: Path) -> None:
+    """Only those that are named, and what they say need not fit the scenario."""
+    plot = scenario(recording={"plots": "plots.jsonl", "ignore": ["camera"]})
+    camera = {"sensor": "camera", "time": 1.0, "plots": [[0.5]]}
+    assert [scan.sensor for scan in read(tmp_path, camera, LINE, {**camera, "time": 2.0}, plot=plot)] == ["a"]
+    with pytest.raises(PlotsError, match="2: sensor: 'lidar' is not one of a, b"):
+        read(tmp_path, LINE, {**camera, "sensor": "lidar"}, plot=plot)
+    with pytest.raises(PlotsError, match="has no scan"):
+        read(tmp_path, camera, plot=plot)
+
+
 def test_empty_lines_do_not_count(tmp_path: Path) -> None:
     assert len(read(tmp_path, "", LINE, "  \t", {**LINE, "sensor": "b"}, "")) == 2
     with pytest.raises(PlotsError, match="has no scan"):
@@ -206,8 +217,10 @@ RECORDED = [
 def test_the_recorded_ferry(name: str, content: dict[str, tuple[int, int]], times: tuple[float, float]) -> None:
     fov = {"shape": "disc", "radius": 500.0}
     sensors = [sensor_table(sensor, position=None, field_of_view=fov, sigma=[5.0, 5.0]) for sensor in content]
-    plot = scenario(*sensors, epoch="2021-05-04T07:54:51Z")
-    scans = read_plots(catalogue.FOLDER / "autoferry" / name, plot)
+    path = catalogue.FOLDER / "autoferry" / name
+    recording = {"plots": path, "ignore": ["infrared", "daylight"]}
+    plot = scenario(*sensors, epoch="2021-05-04T07:54:51Z", recording=recording)
+    scans = read_plots(path, plot)
     seen = {sensor: [scan for scan in scans if scan.sensor == sensor] for sensor in content}
     assert {sensor: (len(own), sum(len(scan.z) for scan in own)) for sensor, own in seen.items()} == content
     assert all(np.diff([scan.time_ns for scan in own]).min() > 0 for own in seen.values())

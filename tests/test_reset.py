@@ -160,7 +160,7 @@ def test_deleted_tracks_are_not_rebased() -> None:
 
 @pytest.mark.parametrize("delay", [0.0, 3.0])
 def test_a_track_that_begins_later_is_not_rebased_before(delay: float) -> None:
-    fusion = {"feedback_delay": delay}
+    fusion = {"feedback_delay": delay, "joint": False}
     plot = resetting(hypothesis=[hypothesis_table(), hypothesis_table(500.0, start=5.0)], fusion=fusion)
     network = Network(plot)
     for scan in network.scans:

@@ -84,6 +84,9 @@ def test_what_a_scenario_lacks_is_named() -> None:
         "test: has no [simulation]; a study draws its worlds, give a duration",
         "test: has no [[hypothesis]]; a study follows the track of hypothesis 0",
     ]
+    assert faults(GOOD, scenario(simulation={"duration": 20.0, "truth": "ships.jsonl"})) == [
+        "test: simulation.truth: a study draws its targets, recorded ones are the same in every world",
+    ]
     late = scenario(hypothesis=[hypothesis_table(start=20.0)])
     assert faults(GOOD, late) == ["test: no sensor scans after hypothesis 0 starts; there is nothing to decide on"]
 

@@ -1,5 +1,7 @@
 """Whole networks, replayed, against theory.md written out a second time: loops over sensors, plots and tracks.
 
+Every track is associated as if it were alone; Eq. (21) has its own tests.
+
 Nothing of ``common.estimation`` is used here: the reference below and in ``reference.py`` comes from the equations.
 """
 
@@ -214,7 +216,14 @@ def three_radars(dimensions: int = 2, **fusion: Any) -> Config:
         "name": "three",
         "motion": {"dimensions": dimensions, "psd": PSD},
         "decision": {"enabled": False},
-        "fusion": {"mode": "federated", "association": "tight", "feedback": "none", "gate_probability": 1.0} | fusion,
+        "fusion": {
+            "mode": "federated",
+            "association": "tight",
+            "feedback": "none",
+            "gate_probability": 1.0,
+            "joint": False,
+        }
+        | fusion,
         "sensor": [
             radar("a", (30.0, 40.0, 35.0)[:dimensions], 0.9, 4.0),
             radar("b", (60.0, 50.0, 90.0)[:dimensions], 0.6, 8.0),

@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.special import gammaincinv
 
-from common.estimation.gating import Near, inside_boxes
+from common.estimation.gating import IntArray, Near, inside_boxes
 from common.estimation.gaussian import (
     LOG_2PI,
     Array,
@@ -46,11 +46,13 @@ class Plots(NamedTuple):
         valid: shape (..., M); false marks padding. None: there is none.
         log_relative: log of the density of false plots where a plot lies, relative to ``Clutter.log_rho_f``, shape
             (..., M). None: it is the same everywhere.
+        number: which plot of its scan each is, where each track has those near it, shape (..., M). None: in order, all.
     """
 
     z: Array
     valid: BoolArray | None = None
     log_relative: Array | None = None
+    number: IntArray | None = None
 
 
 class Clutter(NamedTuple):
@@ -182,20 +184,37 @@ def update(expected: Expected, plots: Plots, choose: Choice = normalise) -> Filt
 def weigh_and_absorb(expected: Expected, plots: Plots, choose: Choice) -> tuple[Gaussian, Array, Array]:
     """``update``, and as third the logarithm of the weight sum of the filter that associates, shape (...)."""
     plots = within_reach(expected, plots)
+    w, log_pdf, inside = compared(expected, plots)
+    q, log_q_bar = choose(log_weights(expected, log_pdf[-1], inside, plots.log_relative))
+    # Eq. (13): with log q_j = log (weight j) - log q_bar, only the densities of the plots do not cancel.
+    log_p_bar = log_q_bar + np.vecdot(q[..., 1:], log_pdf[0] - log_pdf[-1])
+    return absorb(expected, w, q), log_p_bar, log_q_bar
+
+
+def compared(expected: Expected, plots: Plots) -> tuple[Array, Array, BoolArray]:
+    """How plots lie to what was expected.
+
+    Returns:
+        whitened innovations w, shape (F, ..., M, m), 0 for padding; log N(z_j; H x, S_k), shape (F, ..., M); and which
+        plots are in the gate of the filter that associates, shape (..., M).
+    """
     nu = innovations(plots.z, expected.z[..., None, :], expected.angular)
     if plots.valid is not None:
         # Padding may hold anything, and 0 times NaN is no zero.
         nu = np.where(plots.valid[..., None], nu, 0.0)
     w = times_transposed(nu, expected.whitener)
     distance = squared_norm(w)
-    log_pdf = expected.log_peak[..., None] - 0.5 * distance
     inside = distance[-1] <= expected.gate
     if plots.valid is not None:
         inside &= plots.valid
-    q, log_q_bar = choose(log_weights(expected, log_pdf[-1], inside, plots.log_relative))
-    # Eq. (13): with log q_j = log (weight j) - log q_bar, only the densities of the plots do not cancel.
-    log_p_bar = log_q_bar + np.vecdot(q[..., 1:], log_pdf[0] - log_pdf[-1])
-    return absorb(expected, w, q), log_p_bar, log_q_bar
+    return w, expected.log_peak[..., None] - 0.5 * distance, inside
+
+
+def weights_alone(expected: Expected, plots: Plots) -> Array:
+    """Log p*_j (Eq. 6) in the filter that associates, tracks taken one by one, shape (..., 1 + M)."""
+    honest = expected._replace(z=expected.z[-1:], whitener=expected.whitener[-1:], log_peak=expected.log_peak[-1:])
+    _, log_pdf, inside = compared(honest, plots)
+    return log_weights(expected, log_pdf[0], inside, plots.log_relative)
 
 
 def innovations(z: Array, expected: Array, angular: tuple[int, ...]) -> Array:
@@ -216,8 +235,10 @@ def within_reach(expected: Expected, plots: Plots) -> Plots:
         plots: one scan, z of shape (M, m), or scans whose batch axes broadcast against those of the tracks.
 
     Returns:
-        plots with the batch axes of the tracks, or of the scans.
+        plots with the batch axes of the tracks, or of the scans; as they are where they were chosen already.
     """
+    if plots.number is not None:
+        return plots
     pairs = plots.z.shape[-2] * expected.z[0, ..., 0].size
     if pairs <= _FEW_PAIRS or expected.gate == np.inf or expected.angular:
         return plots
@@ -235,6 +256,7 @@ def within_reach(expected: Expected, plots: Plots) -> Plots:
         plots.z[which],
         near.valid.reshape(which.shape),
         None if plots.log_relative is None else plots.log_relative[which],
+        which,
     )
 
 
@@ -246,6 +268,7 @@ def _inside_common_boxes(plots: Plots, center: Array, reach: Array) -> Plots:
         np.take_along_axis(plots.z, which[..., None], axis=-2),
         inside,
         None if relative is None else np.take_along_axis(relative, which, axis=-1),
+        which,
     )
 
 

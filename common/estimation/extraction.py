@@ -240,5 +240,5 @@ def _of(plots: Plots, rows: BoolArray) -> Plots:
     shared = int(np.prod(plots.z.shape[:-2])) == 1
     if shared:
         return plots
-    z, valid, relative = plots
+    z, valid, relative, _ = plots
     return Plots(z[rows], None if valid is None else valid[rows], None if relative is None else relative[rows])

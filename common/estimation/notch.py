@@ -26,12 +26,12 @@ from common.estimation.association import (
     Expected,
     Filtered,
     Plots,
-    innovations,
+    compared,
     log_weights,
     normalise,
 )
 from common.estimation.detection import Notch, log_blind
-from common.estimation.gaussian import Array, Gaussian, moments, squared_norm, symmetric, times_transposed
+from common.estimation.gaussian import Array, Gaussian, moments, symmetric, times_transposed
 from common.estimation.sight import approach
 
 #: Smallest variance that is divided by, relative to v_n: of a state that is known exactly.
@@ -64,15 +64,7 @@ def hypotheses(expected: Expected, plots: Plots, notch: Notch, stand: Array) -> 
     Returns:
         for each filter; which plots lie in the gate is for the last one to say.
     """
-    nu = innovations(plots.z, expected.z[..., None, :], expected.angular)
-    if plots.valid is not None:
-        nu = np.where(plots.valid[..., None], nu, 0.0)
-    w = times_transposed(nu, expected.whitener)
-    distance = squared_norm(w)
-    inside = distance[-1] <= expected.gate
-    if plots.valid is not None:
-        inside &= plots.valid
-    log_pdf = expected.log_peak[..., None] - 0.5 * distance
+    w, log_pdf, inside = compared(expected, plots)
     log_p_star = np.stack([log_weights(expected, pdf, inside, plots.log_relative) for pdf in log_pdf])
     plain = _plain(expected, np.where(inside[..., None], w, 0.0))
     return _with_notch(log_p_star, plain, -np.expm1(expected.log_miss), notch, stand)

@@ -1,1 +1,1 @@
-"""Recorded plots of a ferry's radar and lidar in Trondheim, with the truth of two boats."""
+"""Recorded plots of a ferry's radar, lidar and cameras in Trondheim, with the truth of two boats."""

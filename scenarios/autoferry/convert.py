@@ -1,7 +1,6 @@
 """Converts the Autoferry dataset to this project's JSON Lines.
 
-``python -m scenarios.autoferry.convert FOLDER_OF_THE_DATASET`` writes the kept scenarios anew, beside this module.
-Radar and lidar only: the cameras' bearings are left out.
+``python -m scenarios.autoferry.convert FOLDER_OF_THE_DATASET`` writes all scenarios anew, beside this module.
 """
 
 from __future__ import annotations
@@ -14,28 +13,29 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, TypeGuard, TypeVar
 
-KEPT = (2, 5)
-SENSORS: Mapping[int, str] = {1: "lidar", 2: "radar", 3: "camera", 4: "camera"}
-CONVERTED = ("lidar", "radar")
+SCENARIOS = (2, 3, 5, 13, 16)
+SENSORS: Mapping[int, str] = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
+CAMERAS = ("infrared", "daylight")
 
 Vector = tuple[float, float]
 T = TypeVar("T")
 
 
 class Scan(NamedTuple):
-    """What one sensor saw at one time; cameras carry no plots.
+    """What one sensor saw at one time.
 
     Attributes:
         sensor: one of the values of ``SENSORS``.
         time_s: Unix time.
         position: of the ship, (east, north) in metres from the origin.
-        plots: (east, north) in metres from the origin; none is a miss, not a gap.
+        plots: (east, north) in metres from the origin, of cameras (azimuth,) in radians from the ship, clockwise from
+            north; none is a miss, not a gap.
     """
 
     sensor: str
     time_s: float
     position: Vector
-    plots: tuple[Vector, ...]
+    plots: tuple[tuple[float, ...], ...]
 
 
 class Truth(NamedTuple):
@@ -57,7 +57,7 @@ class Recording(NamedTuple):
 
     Attributes:
         epoch_s: whole Unix second at or before the first detection of any sensor.
-        scans: of the converted sensors, by time.
+        scans: of all sensors, by time.
         truth: each boat and time once, by time.
     """
 
@@ -83,7 +83,7 @@ def read(folder: Path, number: int) -> Recording:
     truth = _parse_all(truth_path, references, parse_truth)
     return Recording(
         epoch_s=math.floor(min(scan.time_s for scan in scans)),
-        scans=tuple(sorted((s for s in scans if s.sensor in CONVERTED), key=lambda scan: scan.time_s)),
+        scans=tuple(sorted(scans, key=lambda scan: scan.time_s)),
         truth=_unique(truth_path, (state for states in truth for state in states)),
     )
 
@@ -120,8 +120,10 @@ def parse_scan(record: object) -> Scan:
     if not _are_numbers(ship, 2):
         raise ValueError(f"ownshipPosition: {_short(ship)}, expected [north, east]")
     north, east = ship
-    plots = parse_plots(_field(record, "measurement")) if sensor in CONVERTED else ()
-    return Scan(sensor, time_s, (east, north), tuple((east + e, north + n) for e, n in plots))
+    measurement = _field(record, "measurement")
+    if sensor in CAMERAS:
+        return Scan(sensor, time_s, (east, north), parse_bearings(measurement))
+    return Scan(sensor, time_s, (east, north), tuple((east + e, north + n) for e, n in parse_plots(measurement)))
 
 
 def parse_plots(measurement: object) -> tuple[Vector, ...]:
@@ -143,6 +145,20 @@ def parse_plots(measurement: object) -> tuple[Vector, ...]:
     raise ValueError(f"measurement: {_short(measurement)}, expected [[n1, n2, ...], [e1, e2, ...]], [n, e] or []")
 
 
+def parse_bearings(measurement: object) -> tuple[tuple[float], ...]:
+    """Turn a measurement of a camera into plots: azimuths in radians, clockwise from north, as the dataset has them.
+
+    The dataset writes ``[b1, b2, ...]``, but ``b`` for one bearing and ``[]`` for none.
+
+    Raises:
+        ValueError: it is none of these, or an angle beyond a whole circle.
+    """
+    bearings = measurement if isinstance(measurement, list) else [measurement]
+    if not _are_numbers(bearings, len(bearings)) or any(abs(bearing) > 2.0 * math.pi for bearing in bearings):
+        raise ValueError(f"measurement: {_short(measurement)}, expected radians: [b1, b2, ...], b or []")
+    return tuple((bearing,) for bearing in bearings)
+
+
 def parse_truth(entry: object) -> list[Truth]:
     """Read one entry of a file of ground truth: the boats at the time of one detection.
 
@@ -155,13 +171,14 @@ def parse_truth(entry: object) -> list[Truth]:
 
 
 def scan_line(scan: Scan, epoch_s: int) -> str:
-    """Write a scan as a line of JSON: time to the microsecond, places to the millimetre."""
+    """Write a scan as a line of JSON: time to the microsecond, places to the millimetre, bearings to 1e-5 rad."""
+    digits = 5 if scan.sensor in CAMERAS else 3
     return json.dumps(
         {
             "sensor": scan.sensor,
             "time": round(scan.time_s - epoch_s, 6),
-            "position": _to_mm(scan.position),
-            "plots": [_to_mm(plot) for plot in scan.plots],
+            "position": _rounded(scan.position, 3),
+            "plots": [_rounded(plot, digits) for plot in scan.plots],
         }
     )
 
@@ -169,7 +186,7 @@ def scan_line(scan: Scan, epoch_s: int) -> str:
 def truth_line(truth: Truth, epoch_s: int) -> str:
     """Write a boat's place at one time as a line of JSON, to the microsecond and millimetre."""
     time_s = round(truth.time_s - epoch_s, 6)
-    return json.dumps({"target": truth.target, "time": time_s, "position": _to_mm(truth.position)})
+    return json.dumps({"target": truth.target, "time": time_s, "position": _rounded(truth.position, 3)})
 
 
 def write(recording: Recording, folder: Path, number: int) -> None:
@@ -183,11 +200,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code is 1, and nothing is written, when the dataset is wrong."""
     parser = argparse.ArgumentParser(prog="python -m scenarios.autoferry.convert", description=__doc__)
     parser.add_argument("dataset", type=Path, help="folder that holds scenarioN_detections.json")
-    parser.add_argument("--scenario", type=int, action="append", help=f"number, repeatable; without it: {KEPT}")
+    parser.add_argument("--scenario", type=int, action="append", help=f"number, repeatable; without it: {SCENARIOS}")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent, help="folder to write to")
     options = parser.parse_args(arguments)
     try:
-        recordings = {number: read(options.dataset, number) for number in options.scenario or KEPT}
+        recordings = {number: read(options.dataset, number) for number in options.scenario or SCENARIOS}
         for number, recording in recordings.items():
             write(recording, options.out, number)
     except (OSError, ValueError) as error:
@@ -264,9 +281,9 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _to_mm(place: Vector) -> list[float]:
+def _rounded(numbers: Iterable[float], digits: int) -> list[float]:
     # adding 0.0 makes -0.0 a plain zero
-    return [round(metres, 3) + 0.0 for metres in place]
+    return [round(number, digits) + 0.0 for number in numbers]
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:

@@ -264,7 +264,7 @@ def runs(count: int, scans: int, *, target: bool) -> Runs:
         looks.append(SensorScan(2.0 * k, sensor, ORIGIN, ORIGIN, Plots(z[:, None], valid[:, None])))
         if k < scans:
             x = x @ F.T + rng.multivariate_normal(np.zeros(4), Q, count)
-    z, valid, _ = looks[0].plots
+    z, valid, *_ = looks[0].plots
     density = seeds(Gaussian(z[:, 0], np.broadcast_to(100.0 * np.eye(2), (*z[:, 0].shape, 2))), 8.0)
     # Every world has a plot to start with, or nothing is asked.
     assert valid is not None

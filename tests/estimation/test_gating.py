@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from common.estimation import association
-from common.estimation.association import Clutter, Plots, expect, update
+from common.estimation.association import Clutter, Plots, expect, update, within_reach
 from common.estimation.gating import inside_boxes
 from common.estimation.gaussian import Gaussian
 from common.estimation.sensing import Position
@@ -53,6 +53,20 @@ def test_plots_out_of_reach_change_nothing(
 def test_no_track_or_no_plot(tracks: int, plots: int) -> None:
     density = Gaussian(np.zeros((tracks, 4)), np.repeat(np.eye(4)[None], tracks, axis=0))
     assert len(filtered(density, np.ones((plots, 2)), 0.99)[0]) == tracks
+
+
+@pytest.mark.parametrize("shared", [True, False])
+def test_near_plots_keep_their_numbers_and_are_chosen_once(shared: bool) -> None:
+    density, z = world(300, 500)
+    one = Gaussian(density.x[None, :, None], density.P[None, :, None])
+    clutter = Clutter(np.full((300, 1), 0.9), np.array(-15.0), 0.99)
+    expected = expect(one, SENSOR.linearise(one, ORIGIN), clutter)
+    near = within_reach(expected, Plots(z if shared else np.tile(z, (300, 1, 1, 1))))
+    assert near.number is not None
+    assert near.valid is not None
+    assert near.number.shape[-1] < len(z)
+    np.testing.assert_array_equal(near.z[near.valid], z[near.number[near.valid]])
+    assert within_reach(expected, near) is near
 
 
 def test_a_scan_far_from_every_track_is_an_empty_scan() -> None:

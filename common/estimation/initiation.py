@@ -1,0 +1,71 @@
+"""Densities that tracks start from: of one plot, or of two (theory.md §8)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from common.estimation.association import innovations
+from common.estimation.gaussian import Array, Gaussian, joseph, squared_norm, symmetric, times_transposed, whitener
+from common.estimation.motion import Motion, predict
+from common.estimation.sensing import Measurement
+
+#: Standard deviation of a position around which a measurement is linearised [m].
+_POINT = 1e-3
+#: Information that is as good as none [1/m^2], so that what a plot says nothing of has a variance.
+_NOTHING = 1e-18
+
+
+def from_plots(z: Array, measurement: Measurement, stand: Array, spread: Array) -> Gaussian:
+    """What a plot says of a target, and no more of what it does not measure than how targets move.
+
+    With the measurement linearised, ``z = h(x0) + H (x - x0) + v``, and a prior N(0, diag(spread^2)) of all but the
+    position: information H' R^-1 H + diag(0, spread^-2). A range rate so tells of the velocity.
+
+    Args:
+        z: plots that tell of a position, shape (M, m).
+        measurement: of the sensor.
+        stand: where it stood [m], shape (d,).
+        spread: standard deviations of velocity, and acceleration, around 0 [m/s, m/s^2], shape (n - d,).
+
+    Returns:
+        states, shapes (M, n), (M, n, n).
+    """
+    d = len(stand)
+    n = d + len(spread)
+    x = np.zeros((len(z), n))
+    x[:, :d] = measurement.locate(z, stand)
+    around = np.diag(np.square(np.concatenate([np.full(d, _POINT), spread])))
+    seen = measurement.linearise(Gaussian(x, np.broadcast_to(around, (len(z), n, n))), stand)
+    information = np.zeros((n, n))
+    information[range(d, n), range(d, n)] = spread**-2.0
+    HR = np.linalg.solve(seen.R, np.broadcast_to(seen.H, (len(z), *seen.H.shape[-2:]))).mT
+    known: Array = HR @ seen.H + information + _NOTHING * np.eye(n)
+    P = symmetric(np.linalg.inv(symmetric(known)).astype(np.float64))
+    return Gaussian(x + np.matvec(P @ HR, innovations(z, seen.z, seen.angular)), P)
+
+
+def with_second(
+    first: Gaussian, dt: Array, z: Array, measurement: Measurement, stand: Array, motion: Motion
+) -> tuple[Gaussian, Array]:
+    """What a second plot adds: one step of the Kalman filter.
+
+    Args:
+        first: states at the time of the first plots, shapes (M, n), (M, n, n).
+        dt: time between the plots [s], shape (M,).
+        z: second plots, shape (M, m).
+        measurement: of the sensor that saw them.
+        stand: where it stood [m], shape (d,).
+        motion: how targets move.
+
+    Returns:
+        states at the time of the second plots, and the squared Mahalanobis distances of these from where they were
+        expected, shape (M,).
+    """
+    predicted = predict(first, motion.transition(dt), motion.noise(dt))
+    seen = measurement.linearise(predicted, stand)
+    PH = times_transposed(predicted.P, seen.H)
+    white, _ = whitener(symmetric(times_transposed(PH.mT, seen.H)) + seen.R)
+    w = np.matvec(white, innovations(z, seen.z, seen.angular))
+    gain = times_transposed(PH, white)
+    P = joseph(predicted.P, gain @ white, seen.H, seen.R)
+    return Gaussian(predicted.x + np.matvec(gain, w), P), squared_norm(w)

@@ -1,0 +1,57 @@
+"""The ``[initiation]`` table of a scenario file: how tracks start from plots that no track claims (theory.md §8)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from common.estimation.gaussian import Array
+from common.quantities import Count, GateProbability, Model, NotNegative, Positive, Probability
+
+
+class InitiationConfig(Model):
+    """How tracks start, and which are one.
+
+    Attributes:
+        plots: a track starts from one plot, or from two of any sensors.
+        speed: standard deviation of each component of a target's velocity [m/s].
+        acceleration: the same of its acceleration, where motion has one [m/s^2].
+        max_speed: no target is faster [m/s]; default: three times ``speed``.
+        within: two plots that start a track lie no farther apart in time [s].
+        claimed: a plot that belongs to the tracks with at least this probability starts none.
+        gate: plots that are this surely not farther apart than two of one target start one track.
+        merge: tracks whose states differ by less than this (squared Mahalanobis distance) are one; 0: none are.
+        tentative: with so many tentative tracks no more start.
+    """
+
+    plots: Literal[1, 2] = 1
+    speed: Positive
+    acceleration: Positive = 1.0
+    max_speed: Positive | None = None
+    within: Positive = 5.0
+    claimed: Probability = 0.5
+    gate: GateProbability = 0.99
+    merge: NotNegative = 0.5
+    tentative: Count = 1000
+
+    @property
+    def fastest(self) -> float:
+        """No target is faster [m/s]."""
+        return 3.0 * self.speed if self.max_speed is None else self.max_speed
+
+    def spread(self, n: int, d: int) -> Array:
+        """Standard deviations of all but the position, shape (n - d,)."""
+        return np.repeat([self.speed, self.acceleration], d)[: n - d]
+
+
+def initiation_faults(initiation: object, window: Any, kinds: Sequence[Any]) -> Iterator[str]:
+    """Faults between ``[initiation]``, the kinds of the sensors, and how long the center keeps reports."""
+    if not isinstance(initiation, dict):
+        return
+    if kinds and all(kind == "bearing" for kind in kinds):
+        yield "initiation: no sensor tells a position, so that no track can start; all are of kind 'bearing'"
+    within = initiation.get("within", 0.0)
+    if isinstance(within, int | float) and isinstance(window, int | float) and within > window:
+        yield f"initiation.within: {within} s is longer than the {window} s (fusion.window) that reports are kept"

@@ -1,0 +1,215 @@
+"""Tracks that start from plots no track claims, and tracks that turn out to be one (theory.md §8)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from common.config import Scenario
+from common.estimation.association import gate_threshold
+from common.estimation.gating import inside_boxes
+from common.estimation.gaussian import Array, BoolArray, Gaussian, quadratic
+from common.estimation.initiation import from_plots, with_second
+from common.estimation.motion import Motion
+from common.estimation.sensing import Measurement, Sensor
+from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE
+from common.initiation_config import InitiationConfig
+from common.messages import Decision, IntArray, Picked, Report
+from common.quantities import NS_PER_S
+from fusion_center.picture import Picture
+
+#: No plot or place is farther [m].
+_LARGEST = 1e9
+
+
+class Unclaimed(NamedTuple):
+    """Plots of one scan that no track of its node claims.
+
+    Attributes:
+        time_ns: of the scan.
+        number: of the sensor.
+        position: where it stood [m], shape (d,).
+        ids: tracks that the node knew, ascending, shape (T,).
+        z: the plots, shape (U, m).
+    """
+
+    time_ns: int
+    number: int
+    position: Array
+    ids: IntArray
+    z: Array
+
+
+class Duplicate(NamedTuple):
+    """A track that is another one."""
+
+    row: int
+    into: int
+
+
+@dataclass(frozen=True)
+class Initiation:
+    """How tracks start.
+
+    Attributes:
+        config: as the scenario says.
+        motion: how targets move.
+        sensors: models of the sensors.
+    """
+
+    config: InitiationConfig
+    motion: Motion
+    sensors: tuple[Sensor, ...]
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Initiation | None:
+        """How tracks of a scenario start; None: only from its hypotheses."""
+        if scenario.initiation is None:
+            return None
+        motion = scenario.motion.build()
+        return cls(scenario.initiation, motion, tuple(sensor.build(motion) for sensor in scenario.sensors))
+
+    def fits(self, report: Report | Picked, number: int) -> bool:
+        """Whether the unclaimed plots of a report are such as its sensor gives, and tell of positions."""
+        z, stand, measurement = report.unclaimed, report.position, self.sensors[number].measurement
+        if not len(z):
+            return True
+        size = measurement.m, self.motion.dimensions
+        near = (np.abs(z) < _LARGEST).all() and (np.abs(stand) < _LARGEST).all()
+        return (z.shape[1], len(stand)) == size and measurement.m >= self.motion.dimensions and bool(near)
+
+    def seeds(self, picture: Picture, now: Sequence[Unclaimed], before: Sequence[Unclaimed]) -> Gaussian:
+        """What starts at a measurement time.
+
+        Args:
+            picture: all tracks, at that time.
+            now: unclaimed plots of that time, by sensor.
+            before: those of earlier times, oldest first.
+
+        Returns:
+            densities that are neither of one target with each other nor, as far as the node that saw the plots knew
+            nothing of it, with a track, shapes (Q, n), (Q, n, n).
+        """
+        room = max(self.config.tentative - int((picture.status == TENTATIVE).sum()), 0)
+        found = Gaussian(np.empty((0, self.motion.n)), np.empty((0, self.motion.n, self.motion.n)))
+        for scan in now:
+            if len(scan.z) and len(found.x) < room:
+                more = self._single(scan) if self.config.plots == 1 else self._pairs(scan, before)
+                found = self._apart(found, more, _live(picture, scan.ids))
+        return Gaussian(found.x[:room], found.P[:room])
+
+    def merged(self, picture: Picture) -> tuple[Picture, list[Decision]]:
+        """The picture without tracks that are another one, and what was decided so."""
+        duplicates = self.duplicates(picture)
+        status = picture.status.copy()
+        status[[duplicate.row for duplicate in duplicates]] = DELETED
+        decisions = [
+            Decision(
+                kind="merged",
+                track=int(picture.ids[row]),
+                time_ns=int(picture.times_ns[row]),
+                log_lr=float(picture.log_lr[row]),
+                log_lr_total=float(picture.log_lr_total[row]),
+                scans=int(picture.scans[row]),
+                into=int(picture.ids[into]),
+            )
+            for row, into in duplicates
+        ]
+        return picture._replace(status=status), decisions
+
+    def duplicates(self, picture: Picture) -> list[Duplicate]:
+        """Tracks of one target, the weaker of each two: not confirmed, of less LR, younger."""
+        rows = np.nonzero((picture.status != DELETED) & (picture.scans > 0))[0]
+        if len(rows) < 2 or self.config.merge == 0.0:
+            return []
+        d = self.motion.dimensions
+        x, P = picture.fused_x[rows], picture.fused_P[rows]
+        reach = np.sqrt(2.0 * self.config.merge * P.diagonal(axis1=-2, axis2=-1)[:, :d])
+        near = inside_boxes(x[:, :d], x[:, :d], reach)
+        # Whichever of two is the wider one has the other in its box.
+        one, at = np.nonzero(near.valid)
+        other = near.which[one, at]
+        pairs = np.unique(np.sort(np.stack([one, other], axis=1)[one != other], axis=1), axis=0)
+        one, other = pairs.T
+        same = quadratic(x[one] - x[other], P[one] + P[other])[0] < self.config.merge
+        rank = np.lexsort((-picture.ids[rows], picture.log_lr_total[rows], picture.status[rows] == CONFIRMED))
+        strength = np.empty(len(rows), np.intp)
+        strength[rank] = np.arange(len(rows))
+        return list(_merged(pairs[same], strength, rows))
+
+    def _single(self, scan: Unclaimed) -> Gaussian:
+        density = self._from_plots(scan)
+        slow = self._slow(density)
+        return Gaussian(density.x[slow], density.P[slow])
+
+    def _pairs(self, scan: Unclaimed, before: Sequence[Unclaimed]) -> Gaussian:
+        """Of every plot and the earlier one that fits it best."""
+        n, count, measurement = self.motion.n, len(scan.z), self._measurement(scan)
+        gate = gate_threshold(self.config.gate, measurement.m)
+        oldest_ns = scan.time_ns - round(self.config.within * NS_PER_S)
+        best, x, P = np.full(count, np.inf), np.zeros((count, n)), np.zeros((count, n, n))
+        for earlier in before:
+            if not oldest_ns <= earlier.time_ns < scan.time_ns:
+                continue
+            first, second = np.divmod(np.arange(len(earlier.z) * count), count)
+            start = self._from_plots(earlier)
+            dt = np.full(len(first), (scan.time_ns - earlier.time_ns) / NS_PER_S)
+            chosen = Gaussian(start.x[first], start.P[first])
+            density, distance = with_second(chosen, dt, scan.z[second], measurement, scan.position, self.motion)
+            fits = (distance <= gate) & self._slow(density)
+            distance = np.where(fits, distance, np.inf).reshape(-1, count)
+            closest = distance.argmin(axis=0) * count + np.arange(count) if len(first) else np.empty(0, np.intp)
+            for plot, pair in enumerate(closest.tolist()):
+                if distance.flat[pair] < best[plot]:
+                    best[plot], x[plot], P[plot] = distance.flat[pair], density.x[pair], density.P[pair]
+        found = np.isfinite(best)
+        return Gaussian(x[found], P[found])
+
+    def _measurement(self, scan: Unclaimed) -> Measurement:
+        return self.sensors[scan.number].measurement
+
+    def _from_plots(self, scan: Unclaimed) -> Gaussian:
+        spread = self.config.spread(self.motion.n, self.motion.dimensions)
+        return from_plots(scan.z, self._measurement(scan), scan.position, spread)
+
+    def _slow(self, density: Gaussian) -> BoolArray:
+        """No faster than a target can be, as far as that is known, and somewhere."""
+        d = self.motion.dimensions
+        somewhere = (density.P.diagonal(axis1=-2, axis2=-1)[:, :d] < _LARGEST**2).all(axis=-1)
+        speed = np.linalg.vector_norm(density.x[:, d : 2 * d], axis=-1)
+        known = np.minimum(density.P.diagonal(axis1=-2, axis2=-1)[:, d : 2 * d].sum(axis=-1), self.config.fastest**2)
+        slow: BoolArray = somewhere & (speed <= self.config.fastest + np.sqrt(known))
+        return slow
+
+    def _apart(self, found: Gaussian, more: Gaussian, tracks: Gaussian) -> Gaussian:
+        """What is found, and what more there is that is neither near that nor near tracks."""
+        d = self.motion.dimensions
+        gate = gate_threshold(self.config.gate, d)
+        x, P = (np.concatenate(parts) for parts in zip(tracks, found, strict=True))
+        x, P = x[:, :d], P[:, :d, :d]
+        kept: list[int] = []
+        for row, (own_x, own_P) in enumerate(zip(more.x[:, :d], more.P[:, :d, :d], strict=True)):
+            if not (quadratic(x - own_x, P + own_P)[0] <= gate).any():
+                kept.append(row)
+                x, P = np.concatenate([x, own_x[None]]), np.concatenate([P, own_P[None]])
+        return Gaussian(*(np.concatenate([old, new[kept]]) for old, new in zip(found, more, strict=True)))
+
+
+def _live(picture: Picture, known: IntArray) -> Gaussian:
+    """Positions of the tracks that a node did not know."""
+    others = (picture.status != DELETED) & ~np.isin(picture.ids, known)
+    return Gaussian(picture.fused_x[others], picture.fused_P[others])
+
+
+def _merged(pairs: IntArray, strength: IntArray, rows: IntArray) -> Iterator[Duplicate]:
+    """The weaker tracks of pairs, each going into a stronger one that stays."""
+    gone: set[int] = set()
+    by_strength = sorted(pairs.tolist(), key=lambda pair: -max(strength[pair[0]], strength[pair[1]]))
+    for pair in by_strength:
+        weak, strong = sorted(pair, key=lambda row: strength[row])
+        if weak not in gone and strong not in gone:
+            gone.add(weak)
+            yield Duplicate(int(rows[weak]), int(rows[strong]))

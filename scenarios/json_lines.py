@@ -1,0 +1,109 @@
+"""Reading JSON Lines: one object a line, blank lines skipped; what is wrong is said with file and line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from common.errors import WaldnetError
+from common.quantities import MAX_SECONDS
+
+T = TypeVar("T")
+
+#: No number is larger; NaN and infinities are none.
+_LARGEST = 1e15
+
+
+def read_lines(
+    path: Path,
+    what: str,
+    keys: Sequence[str],
+    parse: Callable[[dict[str, Any], int], T],
+    failure: type[WaldnetError],
+    optional: Sequence[str] | None = (),
+) -> Iterator[T]:
+    """Parse all lines of a file.
+
+    Args:
+        path: the file.
+        what: a line is, for messages.
+        keys: that every object must have.
+        parse: makes something of an object and its line number; raises ValueError, saying what was got and expected.
+        failure: raised for what is wrong.
+        optional: keys that an object may have too; None for any.
+
+    Yields:
+        what was parsed, line by line.
+
+    Raises:
+        WaldnetError: a ``failure`` naming file, line and reason.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise failure(f"{path}: cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise failure(f"{path}: is no UTF-8 text: {error.reason} at byte {error.start}") from None
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip():
+            try:
+                yield parse(_object(line, what, keys, optional), number)
+            except ValueError as error:
+                raise failure(f"{path}:{number}: {error}") from None
+
+
+def _object(line: str, what: str, keys: Sequence[str], optional: Sequence[str] | None) -> dict[str, Any]:
+    try:
+        entry = json.loads(line)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"is no JSON: {error.msg} at column {error.colno}") from None
+    except RecursionError:
+        raise ValueError(f"is no {what}: nested too deeply") from None
+    if not isinstance(entry, dict):
+        expected = f"{', '.join(keys[:-1])} and {keys[-1]}"
+        raise ValueError(f"is a JSON {type(entry).__name__}, expected an object with {expected}")
+    if missing := sorted(set(keys) - entry.keys()):
+        raise ValueError(f"{missing[0]} is missing")
+    if optional is not None and (unknown := sorted(entry.keys() - {*keys, *optional})):
+        raise ValueError(f"{unknown[0]!r} is no known key; expected {', '.join(sorted({*keys, *optional}))}")
+    return entry
+
+
+def seconds(value: Any) -> float:
+    """A time of a line, in seconds since the scenario's epoch.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if not _is_number(value) or abs(value) > MAX_SECONDS:
+        raise ValueError(f"time: {value!r} is not a number of seconds between -{MAX_SECONDS:g} and {MAX_SECONDS:g}")
+    return float(value)
+
+
+def identity(value: Any, where: str) -> int:
+    """The number by which a line names a target or a track.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or abs(value) > _LARGEST:
+        raise ValueError(f"{where}: {value!r} is not a whole number between -{_LARGEST:g} and {_LARGEST:g}")
+    return value
+
+
+def numbers(value: Any, sizes: Sequence[int], where: str) -> list[float]:
+    """A list of finite numbers, as long as one of the sizes.
+
+    Raises:
+        ValueError: for anything else.
+    """
+    if not isinstance(value, list) or len(value) not in sizes or not all(map(_is_number, value)):
+        expected = " or ".join(map(str, sizes))
+        raise ValueError(f"{where}: {value!r} is not a list of {expected} finite numbers")
+    return value
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST

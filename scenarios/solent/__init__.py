@@ -1,0 +1,1 @@
+"""Recorded ships in the Solent: truth for simulated radars."""

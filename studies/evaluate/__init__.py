@@ -1,0 +1,1 @@
+"""``waldnet evaluate``: how well recorded runs found the targets that truly were there."""

@@ -1,0 +1,80 @@
+"""``waldnet evaluate``: recorded runs beside the truth."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+from cyclopts import Parameter, validators
+
+_INFINITE = float("inf")
+
+#: Metres or seconds, more than none.
+_Positive: TypeAlias = Annotated[float, Parameter(validator=validators.Number(gt=0.0, lt=_INFINITE))]
+_Order: TypeAlias = Annotated[float, Parameter(validator=validators.Number(gte=1.0, lt=_INFINITE))]
+
+
+def evaluate(
+    run: Path,
+    *others: Path,
+    truth: Path,
+    cutoff: _Positive = 100.0,
+    order: _Order = 2.0,
+    window: _Positive = 10.0,
+    gap: _Positive = 5.0,
+    figure: Path | None = None,
+    as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+) -> None:
+    """Tell how well a recorded run found its targets: GOSPA, OSPA(2), confirmation, breaks, swaps, false tracks.
+
+    Args:
+        run: folder that waldnet run wrote, or file of what waldnet replay --json printed.
+        others: further runs, to compare.
+        truth: file of true positions (JSON Lines), such as waldnet simulate --truth writes.
+        cutoff: farther from a target, a track is not of it [m].
+        order: p of GOSPA and OSPA(2).
+        window: of OSPA(2) [s].
+        gap: positions of a target that are farther apart in time are not joined [s].
+        figure: PNG file to write, and a JSON file of the same name beside it; default: evaluation.png in the run's
+            folder, comparison.png if there are several runs.
+        as_json: print one JSON object, and nothing else.
+    """
+    from rich.console import Console
+
+    from scenarios.truth import read_truth
+    from studies.evaluate.evaluation import Rules, judge
+    from studies.evaluate.figure import draw
+    from studies.evaluate.paths import judged_times, targets_at
+    from studies.evaluate.runs import read_runs
+    from studies.evaluate.table import show
+
+    rules = Rules(cutoff_m=cutoff, order=order, window_s=window, gap_s=gap)
+    known = read_truth(truth)
+    d = next((target.positions.shape[1] for target in known.values()), 2)
+    runs = read_runs((run, *others), d)
+    times_s = judged_times(known, runs)
+    targets = targets_at(known, times_s, gap, d)
+    evaluations = [judge(one, targets, times_s, rules) for one in runs]
+    entry: dict[str, Any] = {
+        "truth": str(truth),
+        **rules._asdict(),
+        "first_time": float(times_s[0]),
+        "last_time": float(times_s[-1]),
+        "runs": [evaluation.entry() for evaluation in evaluations],
+    }
+    text = json.dumps(entry, allow_nan=False)
+    picture = figure or _default(run, several=bool(others))
+    draw(evaluations, cutoff, window, picture)
+    picture.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    console = Console(highlight=False, markup=False)
+    if as_json:
+        console.out(text)
+    else:
+        show(console, evaluations, rules)
+        console.print(f"\n{picture}, {picture.with_suffix('.json')}", soft_wrap=True)
+
+
+def _default(run: Path, *, several: bool) -> Path:
+    folder = run if run.is_dir() else run.parent
+    return folder / ("comparison.png" if several else "evaluation.png")

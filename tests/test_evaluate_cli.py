@@ -1,0 +1,228 @@
+"""``waldnet evaluate`` from files to files, and what it says of wrong ones; ``waldnet simulate --truth``."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from builders import scenario
+
+from common.config import load_scenario
+from common.errors import EvaluationError, TruthError
+from common.messages import Tracks
+from common.process import main
+from launch.cli import app
+from scenarios.catalogue import find
+from scenarios.truth import read_truth, write_truth
+from scenarios.world import truth
+from studies.evaluate.runs import names, read_run
+from studies.record import Record
+
+LINE: dict[str, Any] = {"time": 2.0, "track": 5, "status": "confirmed", "x": [1.0, 2.0, 3.0, 4.0], "P": []}
+POINT: dict[str, Any] = {"target": 1, "time": 2.0, "position": [1.0, 2.0]}
+
+
+def write(path: Path, *lines: Any) -> Path:
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("".join((line if isinstance(line, str) else json.dumps(line)) + "\n" for line in lines))
+    return path
+
+
+def straight(count: int = 5, **changes: Any) -> list[dict[str, Any]]:
+    """Lines of a track that goes north, one metre a second."""
+    return [{**LINE, "time": float(k), "x": [0.0, float(k), 0.0, 1.0], **changes} for k in range(count)]
+
+
+def points(count: int = 5, **changes: Any) -> list[dict[str, Any]]:
+    """The truth of it."""
+    return [{**POINT, "time": float(k), "position": [0.0, float(k)], **changes} for k in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ("{", "is no JSON: Expecting property name enclosed in double quotes at column 2"),
+        ("[]", "is a JSON list, expected an object with target, time and position"),
+        ({"target": 1, "time": 2.0}, "position is missing"),
+        ({**POINT, "speed": 3}, "'speed' is no known key; expected position, target, time"),
+        ({**POINT, "target": "a"}, "target: 'a' is not a whole number between -1e+15 and 1e+15"),
+        ({**POINT, "target": True}, "target: True is not a whole number between -1e+15 and 1e+15"),
+        ({**POINT, "target": 10**20}, f"target: {10**20} is not a whole number between -1e+15 and 1e+15"),
+        ({**POINT, "time": None}, "time: None is not a number of seconds between -4e+09 and 4e+09"),
+        ({**POINT, "position": [1.0, None]}, "position: [1.0, None] is not a list of 2 finite numbers"),
+        ({**POINT, "position": [1, 2, 3]}, "position: [1, 2, 3] is not a list of 2 finite numbers"),
+        ({**POINT, "time": 1.0}, "target 1 has a position at 1.0 s already, line 1"),
+        ({**POINT, "time": 1.0 + 1e-10}, "target 1 has a position at 1.0000000001 s already, line 1"),
+    ],
+)
+def test_a_line_that_is_no_truth_is_named(tmp_path: Path, line: Any, reason: str) -> None:
+    path = write(tmp_path / "truth.jsonl", {**POINT, "time": 1.0}, "", line)
+    with pytest.raises(TruthError) as caught:
+        read_truth(path)
+    assert str(caught.value) == f"{path}:3: {reason}"
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ({"time": 2.0, "track": 5, "kind": "confirmed"}, "status is missing"),
+        ({**LINE, "status": "lost"}, "status: 'lost' is not one of tentative, confirmed, deleted"),
+        ({**LINE, "track": 1.5}, "track: 1.5 is not a whole number between -1e+15 and 1e+15"),
+        (
+            {**LINE, "x": [1.0, 2.0]},
+            "x, where the truth has 2 coordinates: [1.0, 2.0] is not a list of 4 or 6 finite numbers",
+        ),
+        ({**LINE, "time": 1.0}, "track 5 is there at 1.0 s already, line 1"),
+    ],
+)
+def test_a_line_that_is_no_track_is_named(tmp_path: Path, line: Any, reason: str) -> None:
+    path = write(tmp_path / "tracks.jsonl", {**LINE, "time": 1.0}, line)
+    for given in (path, tmp_path):
+        with pytest.raises(EvaluationError) as caught:
+            read_run(given, 2)
+        assert str(caught.value) == f"{path}:2: {reason}"
+
+
+def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
+    with pytest.raises(EvaluationError, match=r"tracks.jsonl: cannot be read: No such file or directory"):
+        read_run(tmp_path, 2)
+
+
+def test_only_confirmed_tracks_count(tmp_path: Path) -> None:
+    lines = [{**LINE, "time": 1.0, "status": "tentative"}, {**LINE, "track": 6, "status": "deleted"}, LINE]
+    run = read_run(write(tmp_path / "tracks.jsonl", *reversed(lines)), 2)
+    assert run.times_s.tolist() == [1.0, 2.0]
+    assert run.ids.tolist() == [5]
+    np.testing.assert_array_equal(run.positions, [[[np.nan, np.nan], [1.0, 2.0]]])
+    assert run.span_s == (1.0, 2.0)
+
+
+def test_a_folder_tells_when_it_was_measured(tmp_path: Path) -> None:
+    """A run had nothing to report at first, or ever."""
+    record = Record(scenario())
+    none = Tracks(0, ("a",), *(np.empty(0, np.int64) for _ in range(8)))  # type: ignore[arg-type]
+    for second in (1, 2, 3):
+        record.note(none._replace(time_ns=record.scenario.to_ns(float(second))))
+    write(tmp_path / "tracks.jsonl")
+    assert read_run(tmp_path, 2).span_s is None
+    write(tmp_path / "decisions.json", record.summary({}))
+    assert read_run(tmp_path, 2).span_s == (1.0, 3.0)
+    write(tmp_path / "decisions.json", Record(scenario()).summary({}))
+    assert read_run(tmp_path, 2).span_s is None
+
+
+def test_truth_in_three_dimensions(tmp_path: Path) -> None:
+    path = write(tmp_path / "truth.jsonl", *points(position=[1.0, 2.0, 3.0]))
+    assert read_truth(path)[1].positions.shape == (5, 3)
+    run = read_run(write(tmp_path / "tracks.jsonl", *straight(x=[1.0, 2.0, 3.0, 0.0, 0.0, 0.0])), 3)
+    np.testing.assert_array_equal(run.positions, np.full((1, 5, 3), [1.0, 2.0, 3.0]))
+
+
+def test_runs_are_named_by_what_tells_them_apart(tmp_path: Path) -> None:
+    for name in ("a/run", "b/run", "c"):
+        (tmp_path / name).mkdir(parents=True)
+    assert names([tmp_path / "a/run", tmp_path / "c"]) == ["run", "c"]
+    assert names([tmp_path / "a/run", tmp_path / "b/run"]) == ["a/run", "b/run"]
+    assert names([write(tmp_path / "x/lines.jsonl")]) == ["lines"]
+    with pytest.raises(EvaluationError, match="a run is given twice: "):
+        names([tmp_path / "c", tmp_path / "c"])
+
+
+def command(*words: object) -> None:
+    """A command line that goes well."""
+    with pytest.raises(SystemExit) as caught:
+        main(app, [*map(str, words)])
+    assert caught.value.code == 0
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """What was printed, with one space between words."""
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_a_run_gets_a_table_a_figure_and_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = write(tmp_path / "run" / "tracks.jsonl", *straight(), *straight(track=6, x=[300.0, 0.0, 0.0, 0.0])).parent
+    known = write(tmp_path / "truth.jsonl", *points())
+    command("evaluate", run, "--truth", known)
+    text = said(capsys)
+    assert "targets confirmed 1 of 1 after [s], mean 0.00 held share 100.0%" in text
+    assert "confirmed tracks 2 duplicates 0 false 1 false per minute 15.00" in text
+    assert f"{run}/evaluation.png, {run}/evaluation.json" in text
+    assert (run / "evaluation.png").read_bytes().startswith(b"\x89PNG")
+    rules = ("--cutoff", 400, "--order", 1, "--window", 2, "--gap", 3)
+    command("evaluate", run, "--truth", known, "--json", *rules)
+    printed = capsys.readouterr().out
+    told = json.loads(printed)
+    assert told == json.loads((run / "evaluation.json").read_text())
+    names_of_rules = ("cutoff_m", "order", "window_s", "gap_s", "first_time", "last_time")
+    assert [told[name] for name in names_of_rules] == [400.0, 1.0, 2.0, 3.0, 0.0, 4.0]
+    (entry,) = told["runs"]
+    assert (entry["run"], entry["duplicate_ids"], entry["false_ids"]) == ("run", [6], [])
+    assert entry["gospa_m"] == {"total": 200.0, "localisation": 0.0, "missed": 0.0, "false": 200.0}
+    assert entry["over_time"]["ospa2_m"]["cardinality"] == [200.0] * 5
+
+
+def test_several_runs_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = write(tmp_path / "first" / "tracks.jsonl", *straight()).parent
+    second = write(tmp_path / "second.jsonl", *straight(3), *straight(status="tentative")[3:])
+    known = write(tmp_path / "truth.jsonl", *points(), *points(target=2, position=[9e9, 0.0]))
+    command("evaluate", first, second, "--truth", known, "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert [entry["run"] for entry in told["runs"]] == ["first", "second"]
+    assert [entry["held_share"] for entry in told["runs"]] == [0.5, 0.3]
+    assert json.loads((first / "comparison.json").read_text()) == told
+    command("evaluate", first, second, "--truth", known, "--figure", tmp_path / "both.png")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines if "held share" in line] == [["held", "share", "50.0%", "30.0%"]]
+    assert (tmp_path / "both.png").stat().st_size > 0
+    assert (tmp_path / "both.json").stat().st_size > 0
+
+
+def test_a_run_without_a_track_and_a_world_without_a_target(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    nothing, lines = write(tmp_path / "nothing.jsonl"), write(tmp_path / "lines.jsonl", *straight())
+    known = write(tmp_path / "truth.jsonl", *points())
+    command("evaluate", nothing, "--truth", known)
+    assert "targets confirmed 0 of 1 after [s], mean - held share 0.0%" in said(capsys)
+    command("evaluate", lines, "--truth", nothing)
+    assert "targets confirmed 0 of 0 after [s], mean - held share -" in said(capsys)
+
+
+@pytest.mark.parametrize(
+    ("lines", "known", "reason"),
+    [
+        (straight(), points(time=99.0)[:1], "the truth tells of 99 s to 99 s, the runs of 0 s to 4 s"),
+        ([], [], "the truth tells of no time at all, the runs of no time at all"),
+    ],
+)
+def test_nothing_in_common_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], lines: list[Any], known: list[Any], reason: str
+) -> None:
+    run, told = write(tmp_path / "lines.jsonl", *lines), write(tmp_path / "truth.jsonl", *known)
+    with pytest.raises(SystemExit) as caught:
+        main(app, ["evaluate", str(run), "--truth", str(told)])
+    assert caught.value.code == 1
+    wanted = f"nothing to judge: {reason}; both must be in seconds since the same epoch\n"
+    assert capsys.readouterr().err == wanted
+
+
+def test_the_truth_of_a_simulated_world(tmp_path: Path) -> None:
+    command("simulate", "four-radars", "--seed", 3, "--out", tmp_path / "p", "--truth", tmp_path / "t")
+
+    loaded = load_scenario(find("four-radars"))
+    world = truth(loaded, 3)
+    (found,) = read_truth(tmp_path / "t").values()
+    assert found.times_s.tolist() == [loaded.to_seconds(int(time_ns)) for time_ns in world.times_ns]
+    np.testing.assert_array_equal(found.positions, world.x[0, :, :2])
+    assert len((tmp_path / "p").read_text().splitlines()) == 4 * len(found.times_s)
+
+
+def test_a_target_is_not_in_the_truth_before_it_starts(tmp_path: Path) -> None:
+    late = scenario(target=[{"hypothesis": 0, "start": 7.0}, {"hypothesis": 0}])
+    file = io.StringIO()
+    write_truth(file, *truth(late, 1), late)
+    known = read_truth(write(tmp_path / "truth.jsonl", file.getvalue()))
+    assert (known[0].times_s[0], known[1].times_s[0]) == (8.0, 2.0)

@@ -11,7 +11,7 @@ from common.errors import ConfigError
 from common.messages import Scan
 from scenarios.plots import in_order, read_plots
 from scenarios.world import scan_times_ns, simulate, simulate_all
-from sensor_node.tracker import Schedule
+from sensor_node.state import Schedule
 
 
 class Source(NamedTuple):

@@ -7,17 +7,15 @@ the same code.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit
 
 from common.config import Scenario, SensorConfig
 from common.estimation.association import Expected, Plots
-from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
+from common.estimation.batch import concatenate, take
+from common.estimation.gaussian import Array, Gaussian, log_sum_exp
 from common.estimation.mixture import Mixture
 from common.estimation.representation import globalise, shrink
 from common.estimation.selection import Selection, select
@@ -25,120 +23,7 @@ from common.estimation.sensing import Sensor
 from common.local_filter import SUREST, LocalFilter
 from common.messages import Advice, Begin, IntArray, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
-
-
-class Tracks(NamedTuple):
-    """What a node keeps of every track, one row a track; a single Gaussian is a mixture of one component.
-
-    Attributes:
-        ids: ascending, shape (T,).
-        times_ns: of the factors, shape (T,).
-        log_w: honest weights of the components, sum one, shape (T, C); -inf is no component.
-        log_g: log evidence of the components since the start, with one of them log p_bar, shape (T, C).
-        x, P: factors, shapes (T, C, n), (T, C, n, n).
-        times_a_ns: of the association filters, shape (T,).
-        x_a, P_a: association filters.
-        log_odds: of existence, as far as this sensor knows, shape (T,).
-        network_P: for ``dkf``, the covariances that all sensors' factors have by the models alone, shape
-            (T, S, n, n); otherwise S = 0.
-    """
-
-    ids: IntArray
-    times_ns: IntArray
-    log_w: Array
-    log_g: Array
-    x: Array
-    P: Array
-    times_a_ns: IntArray
-    x_a: Array
-    P_a: Array
-    log_odds: Array
-    network_P: Array
-
-
-class Ready(NamedTuple):
-    """All of the next scan that its plots do not change.
-
-    Attributes:
-        tracks, advice: of the state that it was worked out from; it is of use as long as these are the same.
-        time_ns, position: of the scan.
-        advised: all tracks, advice followed.
-        live: which of them started before the scan.
-        predicted: those, at the time of the scan.
-        mixture: the same, as the filter has them.
-        expected: those, as the sensor will see them.
-    """
-
-    tracks: Tracks
-    advice: tuple[Advice, ...]
-    time_ns: int
-    position: Array
-    advised: Tracks
-    live: BoolArray
-    predicted: Tracks
-    mixture: Mixture
-    expected: Expected
-
-    def fits(self, state: State, time_ns: int, position: Array) -> bool:
-        """Whether it was worked out from the tracks and advice of a state, for the scan of that time and position."""
-        same_state = self.tracks is state.tracks and self.advice is state.advice
-        return same_state and self.time_ns == time_ns and np.array_equal(self.position, position)
-
-
-class Look(NamedTuple):
-    """A scan as the tracker keeps it.
-
-    Attributes:
-        time_ns: of the scan.
-        position: where the sensor stood [m], shape (d,).
-        plots: that all tracks share; in a study, where all tracks start together, of every track its own.
-        log_free: log probability of each plot to belong to none of the tracks there were; None: not told.
-    """
-
-    time_ns: int
-    position: Array
-    plots: Plots
-    log_free: Array | None = None
-
-
-class State(NamedTuple):
-    """State of a node.
-
-    Attributes:
-        epoch: of the newest start message.
-        sequence: number of the next report.
-        tracks: the tracks.
-        recent: scans of the last few seconds, oldest first, for tracks and advice that come late.
-        advice: not followed yet, oldest first.
-        lineage: epoch of the newest rebase followed since the start message; 0: none.
-        rebases: told, and not followed yet.
-        next_id: tracks with lower ids, which the start message did not name, are no more.
-        begun: tracks that began at a center whose start message has not come yet.
-        ready: worked out ahead for the next scan, or None. It saves time and changes nothing.
-    """
-
-    epoch: int
-    sequence: int
-    tracks: Tracks
-    recent: tuple[Look, ...]
-    advice: tuple[Advice, ...] = ()
-    lineage: int = 0
-    rebases: tuple[Rebase, ...] = ()
-    next_id: int = 0
-    begun: tuple[Begin, ...] = ()
-    ready: Ready | None = None
-
-
-class Schedule(NamedTuple):
-    """Scan times of the whole network, which ``dkf`` must know beforehand.
-
-    Attributes:
-        times_ns: ascending.
-        sensors: for every time, the numbers of the sensors that scan then.
-    """
-
-    times_ns: Sequence[int]
-    sensors: Sequence[tuple[int, ...]]
+from sensor_node.state import Look, Ready, Schedule, State, Tracks, alike, left, put_tracks
 
 
 @dataclass(frozen=True)
@@ -234,7 +119,7 @@ class LocalTracker:
         look, unclaimed = self._unclaimed(look, free)
         if self.rounded:
             unclaimed = unclaimed.astype(np.float32).astype(np.float64)
-        tracks = filtered if ready.live.all() else _put(ready.advised, ready.live, filtered)
+        tracks = filtered if ready.live.all() else put_tracks(ready.advised, ready.live, filtered)
         advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
         kept = tuple(old for old in state.recent if old.time_ns >= look.time_ns - self.buffer_ns)
         if self.selection is None:
@@ -363,13 +248,13 @@ class LocalTracker:
 
     def _taken_over(self, state: State, fresh: Tracks, *, alone: bool = True) -> State:
         """The state with new tracks, which have seen the scans that are kept; if not alone, what the others left."""
-        for look in state.recent if alone else map(_left, state.recent):
+        for look in state.recent if alone else map(left, state.recent):
             due = fresh.times_ns < look.time_ns
             if due.any():
                 predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position)
                 mixture, _ = self._filtered(self.filter, mixture, expected, look, predicted.log_odds)
-                fresh = _put(fresh, due, self._with(predicted, mixture))
-        tracks = concatenate(*_alike(state.tracks, fresh))
+                fresh = put_tracks(fresh, due, self._with(predicted, mixture))
+        tracks = concatenate(*alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
         return state._replace(tracks=tracks)
 
@@ -505,41 +390,6 @@ class LocalTracker:
             P_a=P[-1],
             log_odds=log_odds,
         )
-
-
-def _left(look: Look) -> Look:
-    """A scan for tracks that begin later: false plots are the denser, the more the others claim them."""
-    return look if look.log_free is None else look._replace(plots=look.plots._replace(log_relative=-look.log_free))
-
-
-def _put(tracks: Tracks, rows: BoolArray, part: Tracks) -> Tracks:
-    tracks, part = _alike(tracks, part)
-    return put(tracks, rows, part)
-
-
-def _alike(first: Tracks, second: Tracks) -> tuple[Tracks, Tracks]:
-    """Both with the same number of components; those that are added are none."""
-    size = max(first.log_w.shape[1], second.log_w.shape[1])
-    return _grown(first, size), _grown(second, size)
-
-
-def _grown(tracks: Tracks, size: int) -> Tracks:
-    more = size - tracks.log_w.shape[1]
-    if not more:
-        return tracks
-    absent = np.full((len(tracks.ids), more), -np.inf)
-
-    def filled(array: Array) -> Array:
-        return np.concatenate([array, np.repeat(array[:, :1], more, axis=1)], axis=1)
-
-    return tracks._replace(
-        log_w=np.concatenate([tracks.log_w, absent], axis=1),
-        log_g=np.concatenate([tracks.log_g, absent], axis=1),
-        x=filled(tracks.x),
-        P=filled(tracks.P),
-        x_a=filled(tracks.x_a),
-        P_a=filled(tracks.P_a),
-    )
 
 
 def _interval(times_ns: IntArray, t_ns: int) -> Array:

@@ -17,7 +17,11 @@ _LARGEST = float(np.finfo(np.float64).max)
 
 
 class TrackLines:
-    """Turns pictures into lines: every track after every measurement time, deleted ones as they were at the end."""
+    """Turns pictures into lines: every track after every measurement time.
+
+    Deleted tracks are repeated as they were at the end, so that every time has all; not where tracks start by
+    themselves, which would be more and more.
+    """
 
     def __init__(self, scenario: Scenario, lag_s: float | None = None) -> None:
         """For times in seconds since the scenario's epoch.
@@ -43,7 +47,7 @@ class TrackLines:
             for track, x, P in zip(lagged.ids, lagged.x, lagged.P, strict=True):
                 entries[int(track)].update(time_lag=then_s, x_lag=x.tolist(), P_lag=P.tolist())
         for track, entry in sorted({**self._deleted, **entries}.items()):
-            if entry["status"] == "deleted":
+            if entry["status"] == "deleted" and self._scenario.initiation is None:
                 self._deleted[track] = entry
             yield json.dumps({"time": time_s, "track": track, **entry}, allow_nan=False)
 
@@ -67,16 +71,15 @@ def decision_entry(decision: Decision, scenario: Scenario) -> dict[str, Any]:
         "log_lr": finite(decision.log_lr),
         "log_lr_total": finite(decision.log_lr_total),
         "scans": decision.scans,
+        **({"into": decision.into} if decision.kind == "merged" else {}),
     }
 
 
 def decision_text(decision: Decision, scenario: Scenario) -> str:
     """A decision for people."""
     time_s = scenario.to_seconds(decision.time_ns)
-    return (
-        f"{time_s:8.2f} s  track {decision.track} {decision.kind} after {decision.scans} scans, "
-        f"log LR {decision.log_lr:+.2f}"
-    )
+    what = f"{decision.kind} into {decision.into}" if decision.kind == "merged" else decision.kind
+    return f"{time_s:8.2f} s  track {decision.track} {what} after {decision.scans} scans, log LR {decision.log_lr:+.2f}"
 
 
 def finite(value: float) -> float:

@@ -17,8 +17,9 @@ from common.config import Scenario
 from common.estimation.gaussian import Gaussian
 from common.messages import NEVER, Advice, Join, Rebase, Start
 from fusion_center.center import Center
-from sensor_node.tracker import LocalTracker, Schedule
-from sensor_node.tracker import Look as NodeLook
+from sensor_node.state import Look as NodeLook
+from sensor_node.state import Schedule
+from sensor_node.tracker import LocalTracker
 from studies.baselines import centralised, decentralised_decisions, decentralised_mean, own, with_fusion
 from studies.course import Course, Look, Worlds
 from studies.worlds import studied

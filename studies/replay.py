@@ -22,8 +22,8 @@ from common.messages import (
 )
 from fusion_center.center import Center
 from sensor_node.sources import schedule_of
+from sensor_node.state import State as NodeState
 from sensor_node.tracker import LocalTracker
-from sensor_node.tracker import State as NodeState
 
 
 class Replay:

@@ -14,8 +14,9 @@ from fusion_center.center import Center
 from fusion_center.state import Event, Tick
 from fusion_center.state import State as CenterState
 from sensor_node.sources import schedule_of
-from sensor_node.tracker import LocalTracker, Schedule
-from sensor_node.tracker import State as NodeState
+from sensor_node.state import Schedule
+from sensor_node.state import State as NodeState
+from sensor_node.tracker import LocalTracker
 
 BOX = {"shape": "box", "center": [0.0, 0.0], "size": [20_000.0, 20_000.0]}
 

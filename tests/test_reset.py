@@ -20,7 +20,8 @@ from common.quantities import NS_PER_S
 from fusion_center.state import Presence
 from scenarios.world import simulate_all
 from sensor_node.shell import NodeShell
-from sensor_node.tracker import LocalTracker, State
+from sensor_node.state import State
+from sensor_node.tracker import LocalTracker
 from studies.network import run_in_memory
 from studies.record import Record
 from studies.replay import Replay

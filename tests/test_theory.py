@@ -20,8 +20,8 @@ from scipy.stats import chi2, norm
 
 from common.config import Scenario
 from common.messages import NEVER, Advice, Decision, Scan, Start, Tracks
+from sensor_node.state import State as NodeState
 from sensor_node.tracker import LocalTracker
-from sensor_node.tracker import State as NodeState
 from studies.replay import Replay
 
 Config: TypeAlias = dict[str, Any]

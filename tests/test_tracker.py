@@ -15,7 +15,8 @@ from common.estimation.representation import Share
 from common.messages import NEVER, Advice, Scan, Start, Stop
 from scenarios.world import simulate, simulate_all
 from sensor_node.sources import schedule_of
-from sensor_node.tracker import LocalTracker, Tracks
+from sensor_node.state import Tracks
+from sensor_node.tracker import LocalTracker
 
 CONFIGURATIONS = [
     ("federated", "tight"),

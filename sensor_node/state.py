@@ -1,0 +1,164 @@
+"""What a sensor node keeps between two steps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from common.estimation.association import Expected, Plots
+from common.estimation.batch import put
+from common.estimation.gaussian import Array, BoolArray
+from common.estimation.mixture import Mixture
+from common.messages import Advice, Begin, IntArray, Rebase
+
+
+class Tracks(NamedTuple):
+    """What a node keeps of every track, one row a track; a single Gaussian is a mixture of one component.
+
+    Attributes:
+        ids: ascending, shape (T,).
+        times_ns: of the factors, shape (T,).
+        log_w: honest weights of the components, sum one, shape (T, C); -inf is no component.
+        log_g: log evidence of the components since the start, with one of them log p_bar, shape (T, C).
+        x, P: factors, shapes (T, C, n), (T, C, n, n).
+        times_a_ns: of the association filters, shape (T,).
+        x_a, P_a: association filters.
+        log_odds: of existence, as far as this sensor knows, shape (T,).
+        network_P: for ``dkf``, the covariances that all sensors' factors have by the models alone, shape
+            (T, S, n, n); otherwise S = 0.
+    """
+
+    ids: IntArray
+    times_ns: IntArray
+    log_w: Array
+    log_g: Array
+    x: Array
+    P: Array
+    times_a_ns: IntArray
+    x_a: Array
+    P_a: Array
+    log_odds: Array
+    network_P: Array
+
+
+class Ready(NamedTuple):
+    """All of the next scan that its plots do not change.
+
+    Attributes:
+        tracks, advice: of the state that it was worked out from; it is of use as long as these are the same.
+        time_ns, position: of the scan.
+        advised: all tracks, advice followed.
+        live: which of them started before the scan.
+        predicted: those, at the time of the scan.
+        mixture: the same, as the filter has them.
+        expected: those, as the sensor will see them.
+    """
+
+    tracks: Tracks
+    advice: tuple[Advice, ...]
+    time_ns: int
+    position: Array
+    advised: Tracks
+    live: BoolArray
+    predicted: Tracks
+    mixture: Mixture
+    expected: Expected
+
+    def fits(self, state: State, time_ns: int, position: Array) -> bool:
+        """Whether it was worked out from the tracks and advice of a state, for the scan of that time and position."""
+        same_state = self.tracks is state.tracks and self.advice is state.advice
+        return same_state and self.time_ns == time_ns and np.array_equal(self.position, position)
+
+
+class Look(NamedTuple):
+    """A scan as the tracker keeps it.
+
+    Attributes:
+        time_ns: of the scan.
+        position: where the sensor stood [m], shape (d,).
+        plots: that all tracks share; in a study, where all tracks start together, of every track its own.
+        log_free: log probability of each plot to belong to none of the tracks there were; None: not told.
+    """
+
+    time_ns: int
+    position: Array
+    plots: Plots
+    log_free: Array | None = None
+
+
+class State(NamedTuple):
+    """State of a node.
+
+    Attributes:
+        epoch: of the newest start message.
+        sequence: number of the next report.
+        tracks: the tracks.
+        recent: scans of the last few seconds, oldest first, for tracks and advice that come late.
+        advice: not followed yet, oldest first.
+        lineage: epoch of the newest rebase followed since the start message; 0: none.
+        rebases: told, and not followed yet.
+        next_id: tracks with lower ids, which the start message did not name, are no more.
+        begun: tracks that began at a center whose start message has not come yet.
+        ready: worked out ahead for the next scan, or None. It saves time and changes nothing.
+    """
+
+    epoch: int
+    sequence: int
+    tracks: Tracks
+    recent: tuple[Look, ...]
+    advice: tuple[Advice, ...] = ()
+    lineage: int = 0
+    rebases: tuple[Rebase, ...] = ()
+    next_id: int = 0
+    begun: tuple[Begin, ...] = ()
+    ready: Ready | None = None
+
+
+class Schedule(NamedTuple):
+    """Scan times of the whole network, which ``dkf`` must know beforehand.
+
+    Attributes:
+        times_ns: ascending.
+        sensors: for every time, the numbers of the sensors that scan then.
+    """
+
+    times_ns: Sequence[int]
+    sensors: Sequence[tuple[int, ...]]
+
+
+def left(look: Look) -> Look:
+    """A scan for tracks that begin later: false plots are the denser, the more the others claim them."""
+    return look if look.log_free is None else look._replace(plots=look.plots._replace(log_relative=-look.log_free))
+
+
+def put_tracks(tracks: Tracks, rows: BoolArray, part: Tracks) -> Tracks:
+    """The tracks with the chosen rows replaced by those of ``part``, whatever the numbers of components."""
+    tracks, part = alike(tracks, part)
+    return put(tracks, rows, part)
+
+
+def alike(first: Tracks, second: Tracks) -> tuple[Tracks, Tracks]:
+    """Both with the same number of components; those that are added are none."""
+    size = max(first.log_w.shape[1], second.log_w.shape[1])
+    return _grown(first, size), _grown(second, size)
+
+
+def _grown(tracks: Tracks, size: int) -> Tracks:
+    more = size - tracks.log_w.shape[1]
+    if not more:
+        return tracks
+    absent = np.full((len(tracks.ids), more), -np.inf)
+
+    def filled(array: Array) -> Array:
+        return np.concatenate([array, np.repeat(array[:, :1], more, axis=1)], axis=1)
+
+    return tracks._replace(
+        log_w=np.concatenate([tracks.log_w, absent], axis=1),
+        log_g=np.concatenate([tracks.log_g, absent], axis=1),
+        x=filled(tracks.x),
+        P=filled(tracks.P),
+        x_a=filled(tracks.x_a),
+        P_a=filled(tracks.P_a),
+    )

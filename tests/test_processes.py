@@ -328,7 +328,7 @@ NAMES = "autoferry-2, autoferry-5, four-radars, "
         (("node", "four-radars", "radar-9"), r"four-radars: no sensor 'radar-9'; there are radar-1, .*"),
         (
             ("run", "five-radars"),
-            r"five-radars: no such file, and none of the scenarios that come along: autoferry-2, .*",
+            r"five-radars: no such file, and none of the scenarios that come along: autoferry-13-all, .*",
         ),
         (("simulate", "four-radars", "--out", "no/folder.jsonl"), r"no/folder\.jsonl: .*No such file or directory"),
         (("run", "four-radars", "--speed", "max", "--out", "bad.toml"), r"bad\.toml: .*File exists"),

@@ -376,11 +376,6 @@ class LocalTracker:
     def _with(self, tracks: Tracks, mixture: Mixture) -> Tracks:
         """Tracks with other densities; where the factor associates for itself it is both filters."""
         x, P = mixture.density
-        with np.errstate(invalid="ignore"):  # what was impossible stays so
-            gain = log_sum_exp(mixture.log_g) - log_sum_exp(tracks.log_g)
-        log_odds = tracks.log_odds + np.where(np.isnan(gain), 0.0, gain)
-        # What has ended stays so.
-        log_odds = np.where(tracks.log_odds == -np.inf, -np.inf, np.clip(log_odds, -SUREST, SUREST))
         return tracks._replace(
             log_w=mixture.log_w,
             log_g=mixture.log_g,
@@ -388,8 +383,19 @@ class LocalTracker:
             P=P[0],
             x_a=x[-1],
             P_a=P[-1],
-            log_odds=log_odds,
+            log_odds=self._believed(tracks, mixture.log_g),
         )
+
+    def _believed(self, tracks: Tracks, log_g: Array) -> Array:
+        """Log odds of existence after the evidence since, where they are asked for."""
+        if not self.joint and self.claimed is None:
+            return tracks.log_odds
+        with np.errstate(invalid="ignore"):  # what was impossible stays so
+            gain = log_sum_exp(log_g) - log_sum_exp(tracks.log_g)
+        log_odds = np.clip(tracks.log_odds + np.where(np.isnan(gain), 0.0, gain), -SUREST, SUREST)
+        # What has ended stays so.
+        log_odds[tracks.log_odds == -np.inf] = -np.inf
+        return log_odds
 
 
 def _interval(times_ns: IntArray, t_ns: int) -> Array:

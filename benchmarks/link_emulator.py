@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI, _CLONE_NEWNET = 0x400454CA, 0x0001, 0x1000, 0x40000000
 _INTERFACE = "wire0"
+_OWN = str(os.getpid())
 _MTU = 1400
 _libc = ctypes.CDLL(None, use_errno=True)
 
@@ -213,12 +214,30 @@ def build_bridge(hosts: int) -> list[int]:
 
 
 def end_processes(namespaces: list[int]) -> None:
-    """Kill whatever runs inside."""
-    ours = {os.fstat(namespace).st_ino for namespace in namespaces}
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError, ValueError):
-            if (entry / "ns/net").stat().st_ino in ours:
-                os.kill(int(entry.name), signal.SIGKILL)
+    """Kill whatever runs inside, and whatever is about to enter."""
+    held = [os.dup(namespace) for namespace in namespaces]
+    for namespace in namespaces:
+        os.close(namespace)  # by its number others find it: from now on none does
+    ours = {str(Path(f"/proc/self/fd/{namespace}").readlink()) for namespace in held}
+    while inside_now := [pid for pid in _others() if not ours.isdisjoint(_namespaces_of(pid))]:
+        for pid in inside_now:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def _others() -> list[int]:
+    return [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit() and entry.name != _OWN]
+
+
+def _namespaces_of(pid: int) -> Iterator[str]:
+    """That a process holds, and then the one it is in: one that enters is seen either before or after."""
+    process = Path(f"/proc/{pid}")
+    with suppress(OSError):
+        for held in (process / "fd").iterdir():
+            with suppress(OSError):
+                yield str(held.readlink())
+    with suppress(OSError):
+        yield str((process / "ns/net").readlink())
 
 
 def main() -> None:

@@ -107,7 +107,9 @@ import os, subprocess, sys
 from benchmarks.namespaces import Namespaces
 net = Namespaces("a").__enter__()
 child = subprocess.Popen(net.command("a", ["sleep", "600"]))
-print(net._keeper.pid, child.pid, flush=True)
+with open(net.command("a", [])[1].removeprefix("--net=")) as handle:
+    entering = subprocess.Popen(["sleep", "600"], pass_fds=[handle.fileno()])
+print(net._keeper.pid, child.pid, entering.pid, flush=True)
 os.kill(os.getpid(), 9)
 """
     root = Path(__file__).parents[1]

@@ -315,8 +315,16 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
     kinds = [sensor.get("kind", "position") for sensor in sensors]
     yield from initiation_faults(data.get("initiation"), _table(data, "fusion").get("window", 10.0), kinds)
     yield from fusion_faults(_table(data, "fusion"), motion.get("model"))
-    if _table(data, "fusion").get("mode") == "dkf":
+    yield from _mode_faults(_table(data, "fusion").get("mode"), sensors)
+
+
+def _mode_faults(mode: Any, sensors: list[Mapping[str, Any]]) -> Iterator[str]:
+    """Sensors that a mode knows nothing of."""
+    if mode == "dkf":
         yield from _dkf_faults(sensors)
+    for i, sensor in enumerate(sensors if mode in ("dkf", "selected") else ()):
+        if "visibility" in sensor:
+            yield f"sensor.{i}.visibility: mode {mode!r} takes targets for visible all the time; leave it out"
 
 
 def _dkf_faults(sensors: list[Mapping[str, Any]]) -> Iterator[str]:

@@ -26,6 +26,7 @@ from common.estimation.motion import Motion
 from common.estimation.notch import hypotheses, merged
 from common.estimation.representation import Share
 from common.estimation.sensing import Sensor
+from common.estimation.visibility import seen
 
 #: The honest prior and noise of the association filter.
 HONEST = Share(1.0)
@@ -119,7 +120,9 @@ class LocalFilter:
         log_w = modes[-1].log_mu
         return Mixture(log_w - log_sum_exp(log_w)[:, None], modes[0].log_mu, density)
 
-    def expect(self, density: Gaussian, sensor: Sensor, stand: Array, center: Array) -> Expected:
+    def expect(
+        self, density: Gaussian, sensor: Sensor, stand: Array, center: Array, visible: Array | None = None
+    ) -> Expected:
         """What a sensor will see of predicted tracks.
 
         Args:
@@ -127,8 +130,10 @@ class LocalFilter:
             sensor: the sensor model.
             stand: where it stands [m], shape (d,).
             center: of its field of view [m], shape (d,).
+            visible: probability of each track to be visible to it, shape (T,); None: all are.
         """
         p_d = sensor.without_notch.detection_probability(Gaussian(density.x[-1], density.P[-1]), stand, center)
+        p_d = p_d if visible is None else p_d * visible[:, None]
         clutter = Clutter(p_d, np.array(sensor.log_rho_f), self.gate_probability)
         return expect(density, sensor.measurement.linearise(density, stand), clutter)
 
@@ -202,16 +207,37 @@ class LocalFilter:
             the plots, false ones the denser the more the other tracks claim them; and the probability of each plot of
             the scan to be that of none of the tracks, shape (plots,).
         """
-        if isinstance(sensor.detection, Notch):
-            alone = hypotheses(expected, near, sensor.detection, stand).log_p_star[-1]
-        else:
-            alone = weights_alone(expected, near)
+        alone = _log_p_star(expected, near, sensor, stand)
         log_nu, unclaimed = joint(predicted.log_w, alone, near.number, plots, existence)
         log_relative = -log_nu if near.log_relative is None else near.log_relative - log_nu
         return near._replace(log_relative=log_relative), unclaimed
+
+    def visible(
+        self, v: Array, predicted: Mixture, expected: Expected, near: Plots, sensor: Sensor, stand: Array
+    ) -> Array:
+        """Probability of each track to be visible to a sensor, after a scan, shape (T,).
+
+        Args:
+            v: before, shape (T,).
+            predicted: the tracks.
+            expected: the same, as the sensor will see them, if they are visible with probability v.
+            near: the plots near them.
+            sensor: the sensor model.
+            stand: where it stands [m], shape (d,).
+        """
+        weights = predicted.log_w[..., None] + _log_p_star(expected, near, sensor, stand)
+        return seen(v, log_sum_exp(log_sum_exp(weights)))
 
     def report(self, mixture: Mixture) -> Mixture:
         """The terms of a report."""
         if self.choice is not None:
             return mixture
         return terms(mixture, self.terms)
+
+
+def _log_p_star(expected: Expected, near: Plots, sensor: Sensor, stand: Array) -> Array:
+    """Log p*_j (Eq. 6) of every component in the filter that associates, shape (T, C, 1 + M)."""
+    if isinstance(sensor.detection, Notch):
+        log_p_star: Array = hypotheses(expected, near, sensor.detection, stand).log_p_star[-1]
+        return log_p_star
+    return weights_alone(expected, near)

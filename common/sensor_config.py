@@ -19,6 +19,7 @@ from common.estimation.polar import Bearing, Polar, PolarDoppler
 from common.estimation.sector import Sector
 from common.estimation.sensing import Measurement, Position, Sensor
 from common.estimation.sigma_points import SigmaPoint
+from common.estimation.visibility import Visibility
 from common.quantities import (
     WITHIN_RANGE,
     Angle,
@@ -158,6 +159,22 @@ class NotchConfig(Model):
 DetectionConfig: TypeAlias = Annotated[ConstantConfig | SwerlingConfig | NotchConfig, Field(discriminator="model")]
 
 
+class VisibilityConfig(Model):
+    """The sensor loses targets for a while: shadowed, hidden, overlooked; misses come in rows.
+
+    Attributes:
+        visible_for: mean time that a target stays visible, and is detected with ``p_d`` [s].
+        hidden_for: mean time that it then stays hidden, and is not detected [s].
+    """
+
+    visible_for: Positive
+    hidden_for: Positive
+
+    def build(self) -> Visibility:
+        """The visibility model."""
+        return Visibility(self.visible_for, self.hidden_for)
+
+
 class SensorConfig(Model):
     """One sensor: where it stands, what it measures, how surely, and when.
 
@@ -168,10 +185,13 @@ class SensorConfig(Model):
         position: east, north (, up) [m]; a recorded scan may override it. Default: the origin.
         p_d: detection probability inside the field of view; with the detection model "swerling" there is none.
         detection: how the detection probability depends on the target.
+        visibility: how long targets stay visible and hidden to this sensor; default: visible all the time.
         false_plots: mean false plots per scan, uniform in the field of view.
         max_speed: of polar-doppler: false plots have range rates uniform between its negative and itself [m/s].
         update: how plots that are not linear in the state are worked in.
         scan_interval: seconds between scans.
+        spacing: scans that come sooner than this after the last one are passed over [s]: a sensor whose errors last
+            for seconds tells nothing new with every frame, and counts too much if all are taken for independent.
         first_scan: time of the first one [s]; default: one interval after the start.
     """
 
@@ -181,11 +201,13 @@ class SensorConfig(Model):
     sigma: tuple[Positive, ...]
     p_d: Probability | None = None
     detection: DetectionConfig = ConstantConfig()
+    visibility: VisibilityConfig | None = None
     false_plots: FalsePlots
     max_speed: Positive | None = None
     update: Literal["ekf", "sigma-point"] = "ekf"
     field_of_view: FieldOfViewConfig
     scan_interval: Positive = 1.0
+    spacing: NotNegative = 0.0
     first_scan: Annotated[NotNegative, WITHIN_RANGE] | None = None
 
     def build(self, motion: Motion) -> Sensor:
@@ -196,6 +218,7 @@ class SensorConfig(Model):
             self.false_plots,
             self.field_of_view.build(motion.dimensions),
             self.detection.build(),
+            None if self.visibility is None else self.visibility.build(),
         )
 
     def _measurement(self, motion: Motion) -> Measurement:

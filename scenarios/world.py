@@ -14,7 +14,7 @@ import numpy as np
 
 from common.config import Scenario, SensorConfig, TargetConfig
 from common.errors import ConfigError
-from common.estimation.gaussian import Array, draw_noise
+from common.estimation.gaussian import Array, BoolArray, draw_noise
 from common.estimation.imm import draw_path
 from common.estimation.sensing import Sensor
 from common.messages import IntArray, Scan
@@ -103,10 +103,20 @@ def simulate(scenario: Scenario, name: str, seed: int, world: Truth | None = Non
     states = world.x[:, np.searchsorted(world.times_ns, times_ns)]
     sensor, stand = config.build(scenario.motion.build()), config.stand(scenario.motion.dimensions)
     center = config.view_center(stand)
+    states = np.where(_visible(sensor, len(states), times_ns, seed, name)[..., None], states, np.nan)
     return [
         Scan(name, int(t_ns), stand, _plots(sensor, stand, center, states[:, k], rng))
         for k, t_ns in enumerate(times_ns)
     ]
+
+
+def _visible(sensor: Sensor, targets: int, times_ns: IntArray, seed: int, name: str) -> BoolArray:
+    """Which targets the sensor has not lost for the moment, shape (targets, K)."""
+    if sensor.visibility is None or not len(times_ns):
+        return np.ones((targets, len(times_ns)), np.bool_)
+    dt = np.diff(times_ns) / NS_PER_S
+    rngs = (np.random.default_rng([seed, 3, number, *name.encode()]) for number in range(targets))
+    return np.array([sensor.visibility.draw(rng, dt) for rng in rngs]).reshape(targets, -1)
 
 
 def _plots(sensor: Sensor, stand: Array, center: Array, states: Array, rng: np.random.Generator) -> Array:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from common.config import Scenario
 from common.errors import ConfigError
-from common.messages import Scan
+from common.messages import NEVER, Scan
+from common.quantities import NS_PER_S
 from scenarios.plots import in_order, read_plots
 from scenarios.world import scan_times_ns, simulate, simulate_all
 from sensor_node.state import Schedule
@@ -57,17 +58,41 @@ def all_scans(scenario: Scenario, *, plots: Path | None = None, seed: int | None
         PlotsError: when the recording is wrong.
     """
     recording = recording_of(scenario, plots)
-    return simulate_all(scenario, seed_of(scenario, seed)) if recording is None else read_plots(recording, scenario)
+    scans = simulate_all(scenario, seed_of(scenario, seed)) if recording is None else read_plots(recording, scenario)
+    return spaced(scans, scenario)
 
 
 def source(scenario: Scenario, name: str, *, plots: Path | None = None, seed: int | None = None) -> Source:
     """What the named sensor sees; arguments and errors as for ``all_scans``."""
     recording = recording_of(scenario, plots)
     if recording is None:
-        times = ((int(t), i) for i, sensor in enumerate(scenario.sensors) for t in scan_times_ns(scenario, sensor))
-        return Source(simulate(scenario, name, seed_of(scenario, seed)), _schedule(sorted(times)))
-    scans = read_plots(recording, scenario)
+        times = [
+            (int(t_ns), number)
+            for number, sensor in enumerate(scenario.sensors)
+            for t_ns in _spaced(scan_times_ns(scenario, sensor).tolist(), sensor.spacing)
+        ]
+        scans = spaced(simulate(scenario, name, seed_of(scenario, seed)), scenario)
+        return Source(scans, _schedule(sorted(times)))
+    scans = spaced(read_plots(recording, scenario), scenario)
     return Source([scan for scan in scans if scan.sensor == name], schedule_of(scans, scenario))
+
+
+def spaced(scans: Sequence[Scan], scenario: Scenario) -> list[Scan]:
+    """Without the scans that come sooner after the last one of their sensor than its ``spacing``."""
+    kept: set[tuple[str, int]] = set()
+    for sensor in scenario.sensors:
+        times_ns = sorted(scan.time_ns for scan in scans if scan.sensor == sensor.name)
+        kept.update((sensor.name, time_ns) for time_ns in _spaced(times_ns, sensor.spacing))
+    return [scan for scan in scans if (scan.sensor, scan.time_ns) in kept]
+
+
+def _spaced(times_ns: Iterable[int], spacing_s: float) -> Iterator[int]:
+    """Of ascending times those that are far enough from the last one."""
+    next_ns = -NEVER
+    for time_ns in times_ns:
+        if time_ns >= next_ns:
+            next_ns = time_ns + round(spacing_s * NS_PER_S)
+            yield time_ns
 
 
 def schedule_of(scans: Iterable[Scan], scenario: Scenario) -> Schedule:

@@ -26,6 +26,7 @@ class Tracks(NamedTuple):
         times_a_ns: of the association filters, shape (T,).
         x_a, P_a: association filters.
         log_odds: of existence, as far as this sensor knows, shape (T,).
+        visible: probability to be visible to each sensor of the network, as far as it tells this node, shape (T, S).
         network_P: for ``dkf``, the covariances that all sensors' factors have by the models alone, shape
             (T, S, n, n); otherwise S = 0.
     """
@@ -40,6 +41,7 @@ class Tracks(NamedTuple):
     x_a: Array
     P_a: Array
     log_odds: Array
+    visible: Array
     network_P: Array
 
 

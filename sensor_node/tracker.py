@@ -114,8 +114,7 @@ class LocalTracker:
         """``scan``, for plots that may be of every track its own."""
         state = self._rebased(state, look.time_ns)
         ready = self._ready(state, look.time_ns, look.position)
-        mixture, free = self._filtered(self.filter, ready.mixture, ready.expected, look, ready.predicted.log_odds)
-        filtered = self._with(ready.predicted, mixture)
+        mixture, filtered, free = self._seen(ready.predicted, ready.mixture, ready.expected, look)
         look, unclaimed = self._unclaimed(look, free)
         if self.rounded:
             unclaimed = unclaimed.astype(np.float32).astype(np.float64)
@@ -252,8 +251,7 @@ class LocalTracker:
             due = fresh.times_ns < look.time_ns
             if due.any():
                 predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position)
-                mixture, _ = self._filtered(self.filter, mixture, expected, look, predicted.log_odds)
-                fresh = put_tracks(fresh, due, self._with(predicted, mixture))
+                fresh = put_tracks(fresh, due, self._seen(predicted, mixture, expected, look)[1])
         tracks = concatenate(*alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
         return state._replace(tracks=tracks)
@@ -297,8 +295,10 @@ class LocalTracker:
             if due.any():
                 prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
                 predicted = honest.predict(prior, _interval(times[due], look.time_ns))
-                expected = self._seen(honest, predicted, look.position)
-                filtered, _ = self._filtered(honest, predicted, expected, look, tracks.log_odds[due])
+                visible = tracks.visible[due, self.number]
+                expected = self._expected(honest, predicted, look.position, visible)
+                near, _ = self._near(honest, predicted, expected, look, tracks.log_odds[due])
+                filtered = honest.update(predicted, expected, near, self.sensor, look.position)
                 log_w[due], _, ((x_a[due],), (P_a[due],)) = filtered
                 times[due] = look.time_ns
         return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times)
@@ -309,32 +309,68 @@ class LocalTracker:
         both = Gaussian(np.stack([start.x, start.x_a]), np.stack([start.P, start.P_a]))
         log_w, log_g, (x, P) = self.filter.spread(both, start.log_p_bar)
         network_P = np.repeat(start.P[:, None], network, axis=1)
-        log_odds = np.zeros(len(start.ids))
+        known = np.array([sensor.visibility.share if sensor.visibility else 1.0 for sensor in self.sensors])
         return Tracks(
-            start.ids, start.times_ns, log_w, log_g, x[0], P[0], start.times_ns, x[1], P[1], log_odds, network_P
+            ids=start.ids,
+            times_ns=start.times_ns,
+            log_w=log_w,
+            log_g=log_g,
+            x=x[0],
+            P=P[0],
+            times_a_ns=start.times_ns,
+            x_a=x[1],
+            P_a=P[1],
+            log_odds=np.zeros(len(start.ids)),
+            visible=np.tile(known, (len(start.ids), 1)),
+            network_P=network_P,
         )
 
     def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Mixture, Expected]:
         """Predict to a time, and what the sensor will see from a position then."""
         mixture, network_P = self._predict(tracks, time_ns)
         now = np.full_like(tracks.times_ns, time_ns)
-        predicted = self._with(tracks._replace(times_ns=now, times_a_ns=now, network_P=network_P), mixture)
-        return predicted, mixture, self._seen(self.filter, mixture, position)
+        visible = self._still_visible(tracks.visible, (time_ns - tracks.times_ns) / NS_PER_S)
+        predicted = tracks._replace(times_ns=now, times_a_ns=now, visible=visible, network_P=network_P)
+        predicted = self._with(predicted, mixture)
+        return predicted, mixture, self._expected(self.filter, mixture, position, visible[:, self.number])
 
-    def _seen(self, local: LocalFilter, predicted: Mixture, position: Array) -> Expected:
-        return local.expect(predicted.density, self.sensor, position, self.config.view_center(position))
+    def _still_visible(self, visible: Array, dt: Array) -> Array:
+        """Probabilities to be visible to each sensor after the time ``dt`` [s], shapes (T, S), (T,)."""
+        visible = visible.copy()
+        for number, sensor in enumerate(self.sensors):
+            if sensor.visibility is not None:
+                visible[:, number] = sensor.visibility.predict(visible[:, number], dt)
+        return visible
 
-    def _filtered(
-        self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
-    ) -> tuple[Mixture, Array | None]:
+    def _expected(self, local: LocalFilter, predicted: Mixture, position: Array, visible: Array) -> Expected:
+        center = self.config.view_center(position)
+        known = None if self.sensor.visibility is None else visible
+        return local.expect(predicted.density, self.sensor, position, center, known)
+
+    def _seen(
+        self, predicted: Tracks, mixture: Mixture, expected: Expected, look: Look
+    ) -> tuple[Mixture, Tracks, Array | None]:
         """Tracks after a scan, and the probability of each plot to be that of none; None: not asked for."""
+        near, free = self._near(self.filter, mixture, expected, look, predicted.log_odds)
+        filtered = self.filter.update(mixture, expected, near, self.sensor, look.position)
+        tracks = self._with(predicted, filtered)
+        if self.sensor.visibility is not None:
+            visible, v = tracks.visible.copy(), tracks.visible[:, self.number]
+            visible[:, self.number] = self.filter.visible(v, mixture, expected, near, self.sensor, look.position)
+            tracks = tracks._replace(visible=visible)
+        return filtered, tracks, free
+
+    def _near(
+        self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
+    ) -> tuple[Plots, Array | None]:
+        """The plots near the tracks, shared among them, and the probability of each plot to be that of none."""
         near, free = local.near(expected, look.plots, self.sensor, look.position), None
         wanted = self.claimed is not None or (self.joint and len(log_odds) > 1)
         if wanted and look.plots.z.ndim == 2:
             plots, existence = len(look.plots.z), expit(log_odds)
             shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
             near = shared if self.joint else near
-        return local.update(predicted, expected, near, self.sensor, look.position), free
+        return near, free
 
     def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
         mixture = self._mixture(tracks)

@@ -150,6 +150,9 @@ def check(scenario: Scenario, order: Order, known: Sequence[str]) -> None:
 
 
 def _scenario_faults(scenario: Scenario) -> Iterator[str]:
+    for sensor in scenario.sensors:
+        if sensor.visibility is not None:
+            yield f"{scenario.name}: sensor {sensor.name!r} has a visibility; the modes of a study know none"
     if scenario.simulation is None:
         yield f"{scenario.name}: has no [simulation]; a study draws its worlds, give a duration"
     elif scenario.simulation.truth is not None:

@@ -9,6 +9,7 @@ import numpy as np
 from common.estimation.detection import Constant, Detection, Notch
 from common.estimation.field_of_view import FieldOfView
 from common.estimation.gaussian import Array, BoolArray, Gaussian
+from common.estimation.visibility import Visibility
 
 
 class Linearised(NamedTuple):
@@ -147,6 +148,7 @@ class Sensor(NamedTuple):
         false_plots: mean number of false plots per scan, uniform in the field of view.
         field_of_view: where it sees.
         detection: how the detection probability depends on the target's state.
+        visibility: how long it loses targets; None: it does not.
     """
 
     measurement: Measurement
@@ -154,6 +156,7 @@ class Sensor(NamedTuple):
     false_plots: float
     field_of_view: FieldOfView
     detection: Detection = Constant()
+    visibility: Visibility | None = None
 
     @property
     def log_rho_f(self) -> float:

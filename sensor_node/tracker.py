@@ -10,37 +10,35 @@ from bisect import bisect_right
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
 
-from common.config import Scenario, SensorConfig
+from common.config import Scenario
+from common.estimation import clutter_map
 from common.estimation.association import Expected, Plots
 from common.estimation.batch import concatenate, take
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp
 from common.estimation.mixture import Mixture
 from common.estimation.representation import globalise, shrink
 from common.estimation.selection import Selection, select
-from common.estimation.sensing import Sensor
 from common.local_filter import SUREST, LocalFilter
 from common.messages import Advice, Begin, IntArray, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
+from sensor_node.sight import Sight
 from sensor_node.state import Look, Ready, Schedule, State, Tracks, alike, left, put_tracks
 
 
 @dataclass(frozen=True)
 class LocalTracker:
-    """The steps of one sensor's tracker.
+    """The steps of one sensor's tracker; it works in the scans of other sensors as well, where it is given them.
 
     Attributes:
-        config: the sensor as the scenario describes it.
-        sensor: the sensor model.
-        sensors: models of all sensors of the network.
-        number: of this sensor among them.
+        name: of the sensor.
+        number: of it among all sensors of the network.
+        sights: of all of them.
         filter: predicts and filters the tracks.
         feedback: the center answers every measurement time: with the fused tracks, as advice or to begin anew
             (theory.md §3, 6), or with those that begin (§8).
         advised: that answer is advice or to begin anew.
-        joint: tracks that share plots are associated jointly (Eq. 21).
-        claimed: a plot that belongs to the tracks with at least this probability starts none; None: none does.
+        believing: it is kept how surely tracks exist.
         rounded: reports are in single precision.
         selection: which plots are sent, where the center tracks; else None.
         digest: of what the center must have in common with this node.
@@ -48,15 +46,13 @@ class LocalTracker:
         schedule: scan times of the network, only for ``dkf``.
     """
 
-    config: SensorConfig
-    sensor: Sensor
-    sensors: tuple[Sensor, ...]
+    name: str
     number: int
+    sights: tuple[Sight, ...]
     filter: LocalFilter
     feedback: bool
     advised: bool
-    joint: bool
-    claimed: float | None
+    believing: bool
     rounded: bool
     selection: Selection | None
     digest: str
@@ -73,20 +69,15 @@ class LocalTracker:
         """
         if scenario.fusion.mode == "dkf" and schedule is None:
             raise ValueError("mode 'dkf' needs the scan times of all sensors beforehand")
-        motion = scenario.motion.build()
-        config = scenario.sensor(name)
-        sensors = tuple(sensor.build(motion) for sensor in scenario.sensors)
-        number = scenario.sensor_names.index(name)
+        sights = tuple(Sight.of(scenario, number) for number in range(len(scenario.sensors)))
         return cls(
-            config=config,
-            sensor=sensors[number],
-            sensors=sensors,
-            number=number,
+            name=name,
+            number=scenario.sensors.index(scenario.sensor(name)),
+            sights=sights,
             filter=LocalFilter.of(scenario),
             feedback=scenario.fusion.feedback != "none" or scenario.initiation is not None,
             advised=scenario.fusion.feedback != "none",
-            joint=scenario.joint,
-            claimed=None if scenario.initiation is None or config.kind == "bearing" else scenario.initiation.claimed,
+            believing=scenario.joint or any(sight.sharing for sight in sights),
             rounded=scenario.fusion.precision == "float32",
             selection=scenario.fusion.selection.build() if scenario.fusion.mode == "selected" else None,
             digest=scenario.digest,
@@ -99,23 +90,30 @@ class LocalTracker:
         n, none = self.filter.motion.n, np.empty(0, np.int64)
         x, P = np.empty((0, n)), np.empty((0, n, n))
         start = Start("", epoch=0, ids=none, times_ns=none, log_p_bar=np.empty(0), x=x, P=P, x_a=x, P_a=P)
-        return State(epoch=0, sequence=0, tracks=self._fresh(start), recent=())
+        maps = tuple(None if sight.clutter is None else clutter_map.start(n) for sight in self.sights)
+        return State(epoch=0, sequence=0, tracks=self._fresh(start), recent=(), maps=maps)
 
     def prepare(self, state: State, time_ns: int, position: Array) -> State:
         """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
         state = self._rebased(state, time_ns)
-        return state._replace(ready=self._ready(state, time_ns, position))
+        return state._replace(ready=self._ready(state, time_ns, position, self.number))
 
     def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report | Picked]:
         """Filter one scan and report every track that started before it."""
-        return self.look(state, Look(scan.time_ns, scan.position, Plots(scan.z)), next_ns)
+        number = next(sight.number for sight in self.sights if sight.config.name == scan.sensor)
+        return self.look(state, Look(scan.time_ns, scan.position, Plots(scan.z), number), next_ns)
 
     def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""
-        state = self._rebased(state, look.time_ns)
-        ready = self._ready(state, look.time_ns, look.position)
-        mixture, filtered, free = self._seen(ready.predicted, ready.mixture, ready.expected, look)
-        look, unclaimed = self._unclaimed(look, free)
+        sight, state = self.sights[look.number], self._rebased(state, look.time_ns)
+        look = sight.mapped(state.maps[look.number], look)
+        ready = self._ready(state, look.time_ns, look.position, look.number)
+        mixture, visible, free = sight.look(self.filter, ready.predicted, ready.mixture, ready.expected, look)
+        filtered = self._with(ready.predicted, mixture)._replace(visible=visible)
+        maps = tuple(
+            sight.learned(seen, look, free) if number == look.number else seen for number, seen in enumerate(state.maps)
+        )
+        look, unclaimed = sight.unclaimed(look, free)
         if self.rounded:
             unclaimed = unclaimed.astype(np.float32).astype(np.float64)
         tracks = filtered if ready.live.all() else put_tracks(ready.advised, ready.live, filtered)
@@ -126,17 +124,8 @@ class LocalTracker:
         else:
             report = self._picked(state, look, next_ns, ready, self.selection, unclaimed)
         sequence, recent = state.sequence + 1, (*kept, look)
-        return state._replace(sequence=sequence, tracks=tracks, recent=recent, advice=advice, ready=None), report
-
-    def _unclaimed(self, look: Look, free: Array | None) -> tuple[Look, Array]:
-        """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""
-        z = look.plots.z
-        if self.claimed is None or z.ndim > 2:
-            return look, np.empty((0, z.shape[-1]))
-        if free is None:
-            return look, z
-        with np.errstate(divide="ignore"):  # surely claimed
-            return look._replace(log_free=np.log(free)), z[free > 1.0 - self.claimed]
+        state = state._replace(sequence=sequence, tracks=tracks, recent=recent, advice=advice, maps=maps, ready=None)
+        return state, report
 
     def _picked(
         self, state: State, look: Look, next_ns: int, ready: Ready, selection: Selection, unclaimed: Array
@@ -153,7 +142,7 @@ class LocalTracker:
         if self.rounded:
             z = z.astype(np.float32).astype(np.float64)
         return Picked(
-            sensor=self.config.name,
+            sensor=self.configs[look.number].name,
             sequence=state.sequence,
             time_ns=look.time_ns,
             next_ns=next_ns,
@@ -175,7 +164,7 @@ class LocalTracker:
         if self.rounded:
             x, P = x.astype(np.float32).astype(np.float64), P.astype(np.float32).astype(np.float64)
         return Report(
-            sensor=self.config.name,
+            sensor=self.configs[look.number].name,
             sequence=state.sequence,
             time_ns=look.time_ns,
             next_ns=next_ns,
@@ -185,7 +174,7 @@ class LocalTracker:
             log_g=mixture.log_g[there],
             x=x,
             P=P,
-            position=look.position if self.claimed is not None else np.empty(0),
+            position=look.position if self._claimed(look.number) is not None else np.empty(0),
             unclaimed=unclaimed,
         )
 
@@ -250,8 +239,9 @@ class LocalTracker:
         for look in state.recent if alone else map(left, state.recent):
             due = fresh.times_ns < look.time_ns
             if due.any():
-                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position)
-                fresh = put_tracks(fresh, due, self._seen(predicted, mixture, expected, look)[1])
+                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position, look.number)
+                mixture, visible, _ = self.sights[look.number].look(self.filter, predicted, mixture, expected, look)
+                fresh = put_tracks(fresh, due, self._with(predicted, mixture)._replace(visible=visible))
         tracks = concatenate(*alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
         return state._replace(tracks=tracks)
@@ -264,15 +254,17 @@ class LocalTracker:
         """Keep advice for the next scan after its time (theory.md §6)."""
         return state._replace(advice=(*state.advice, advice))
 
-    def _ready(self, state: State, time_ns: int, position: Array) -> Ready:
+    def _ready(self, state: State, time_ns: int, position: Array, number: int) -> Ready:
         """What the scan of a time needs: as it was prepared, where that still holds."""
         ready = state.ready
-        if ready is not None and ready.fits(state, time_ns, position):
+        if ready is not None and ready.fits(state, time_ns, position, number):
             return ready
         advised = self._follow_advice(state, time_ns)
-        live = advised.times_ns < time_ns
-        moving = self._expect(take(advised, live), time_ns, position)
-        return Ready(state.tracks, state.advice, time_ns, position, advised, live, *moving)
+        # Another sensor may have scanned at this very time.
+        again = bool(state.recent) and state.recent[-1].time_ns == time_ns
+        live = advised.times_ns < time_ns + again
+        moving = self._expect(take(advised, live), time_ns, position, number)
+        return Ready(state.tracks, state.advice, time_ns, position, number, advised, live, *moving)
 
     def _follow_advice(self, state: State, t_ns: int) -> Tracks:
         """Set the association filters to the newest fused tracks from before ``t_ns`` and redo the scans since.
@@ -295,21 +287,21 @@ class LocalTracker:
             if due.any():
                 prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
                 predicted = honest.predict(prior, _interval(times[due], look.time_ns))
-                visible = tracks.visible[due, self.number]
-                expected = self._expected(honest, predicted, look.position, visible)
-                near, _ = self._near(honest, predicted, expected, look, tracks.log_odds[due])
-                filtered = honest.update(predicted, expected, near, self.sensor, look.position)
+                sight, visible = self.sights[look.number], tracks.visible[due, look.number]
+                expected = sight.expect(honest, predicted, look.position, visible)
+                filtered = sight.filter(honest, predicted, expected, look, tracks.log_odds[due])
                 log_w[due], _, ((x_a[due],), (P_a[due],)) = filtered
                 times[due] = look.time_ns
         return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times)
 
     def _fresh(self, start: Start) -> Tracks:
         """Tracks as they are told of."""
-        network = len(self.sensors) if self.schedule else 0
+        network = len(self.sights) if self.schedule else 0
         both = Gaussian(np.stack([start.x, start.x_a]), np.stack([start.P, start.P_a]))
         log_w, log_g, (x, P) = self.filter.spread(both, start.log_p_bar)
         network_P = np.repeat(start.P[:, None], network, axis=1)
-        known = np.array([sensor.visibility.share if sensor.visibility else 1.0 for sensor in self.sensors])
+        models = (sight.sensor.visibility for sight in self.sights)
+        visible = np.array([model.share if model is not None else 1.0 for model in models])
         return Tracks(
             ids=start.ids,
             times_ns=start.times_ns,
@@ -321,56 +313,26 @@ class LocalTracker:
             x_a=x[1],
             P_a=P[1],
             log_odds=np.zeros(len(start.ids)),
-            visible=np.tile(known, (len(start.ids), 1)),
+            visible=np.tile(visible, (len(start.ids), 1)),
             network_P=network_P,
         )
 
-    def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Mixture, Expected]:
-        """Predict to a time, and what the sensor will see from a position then."""
+    def _expect(self, tracks: Tracks, time_ns: int, position: Array, number: int) -> tuple[Tracks, Mixture, Expected]:
+        """Predict to a time, and what a sensor will see from a position then."""
         mixture, network_P = self._predict(tracks, time_ns)
         now = np.full_like(tracks.times_ns, time_ns)
         visible = self._still_visible(tracks.visible, (time_ns - tracks.times_ns) / NS_PER_S)
         predicted = tracks._replace(times_ns=now, times_a_ns=now, visible=visible, network_P=network_P)
-        predicted = self._with(predicted, mixture)
-        return predicted, mixture, self._expected(self.filter, mixture, position, visible[:, self.number])
+        expected = self.sights[number].expect(self.filter, mixture, position, visible[:, number])
+        return self._with(predicted, mixture), mixture, expected
 
     def _still_visible(self, visible: Array, dt: Array) -> Array:
         """Probabilities to be visible to each sensor after the time ``dt`` [s], shapes (T, S), (T,)."""
         visible = visible.copy()
-        for number, sensor in enumerate(self.sensors):
-            if sensor.visibility is not None:
-                visible[:, number] = sensor.visibility.predict(visible[:, number], dt)
+        for sight in self.sights:
+            if (model := sight.sensor.visibility) is not None:
+                visible[:, sight.number] = model.predict(visible[:, sight.number], dt)
         return visible
-
-    def _expected(self, local: LocalFilter, predicted: Mixture, position: Array, visible: Array) -> Expected:
-        center = self.config.view_center(position)
-        known = None if self.sensor.visibility is None else visible
-        return local.expect(predicted.density, self.sensor, position, center, known)
-
-    def _seen(
-        self, predicted: Tracks, mixture: Mixture, expected: Expected, look: Look
-    ) -> tuple[Mixture, Tracks, Array | None]:
-        """Tracks after a scan, and the probability of each plot to be that of none; None: not asked for."""
-        near, free = self._near(self.filter, mixture, expected, look, predicted.log_odds)
-        filtered = self.filter.update(mixture, expected, near, self.sensor, look.position)
-        tracks = self._with(predicted, filtered)
-        if self.sensor.visibility is not None:
-            visible, v = tracks.visible.copy(), tracks.visible[:, self.number]
-            visible[:, self.number] = self.filter.visible(v, mixture, expected, near, self.sensor, look.position)
-            tracks = tracks._replace(visible=visible)
-        return filtered, tracks, free
-
-    def _near(
-        self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
-    ) -> tuple[Plots, Array | None]:
-        """The plots near the tracks, shared among them, and the probability of each plot to be that of none."""
-        near, free = local.near(expected, look.plots, self.sensor, look.position), None
-        wanted = self.claimed is not None or (self.joint and len(log_odds) > 1)
-        if wanted and look.plots.z.ndim == 2:
-            plots, existence = len(look.plots.z), expit(log_odds)
-            shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
-            near = shared if self.joint else near
-        return near, free
 
     def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
         mixture = self._mixture(tracks)
@@ -398,7 +360,7 @@ class LocalTracker:
             x[due], P[due] = share.predict(Gaussian(x_own, common.P), motion, _interval(times[due], event_ns))
             network_P[due] = P[due][:, None]
             for number in scanning:
-                linear = self.sensors[number].measurement.linearise(
+                linear = self.sights[number].sensor.measurement.linearise(
                     Gaussian(x[due], P[due]), np.zeros(self.filter.motion.dimensions)
                 )
                 network_P[due, number] = shrink(P[due], linear.H, linear.R)
@@ -424,7 +386,7 @@ class LocalTracker:
 
     def _believed(self, tracks: Tracks, log_g: Array) -> Array:
         """Log odds of existence after the evidence since, where they are asked for."""
-        if not self.joint and self.claimed is None:
+        if not self.believing:
             return tracks.log_odds
         with np.errstate(invalid="ignore"):  # what was impossible stays so
             gain = log_sum_exp(log_g) - log_sum_exp(tracks.log_g)

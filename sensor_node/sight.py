@@ -1,0 +1,140 @@
+"""What one sensor sees of a tracker's tracks: scan by scan, which plots are theirs, which are left, which are false."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import expit
+
+from common.config import Scenario, SensorConfig
+from common.estimation import clutter_map
+from common.estimation.association import Expected, Plots
+from common.estimation.clutter_map import ClutterMap, ClutterModel
+from common.estimation.gaussian import Array
+from common.estimation.mixture import Mixture
+from common.estimation.sensing import Sensor
+from common.local_filter import LocalFilter
+from sensor_node.state import Look, Tracks
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A sensor, as a tracker uses it.
+
+    Attributes:
+        config: the sensor as the scenario describes it.
+        sensor: its model.
+        number: of it in the scenario.
+        clutter: what is believed of its false plots, if it maps them; else None.
+        joint: tracks that share plots are associated jointly (Eq. 21).
+        claimed: a plot that belongs to the tracks with at least this probability starts none; None: none does.
+    """
+
+    config: SensorConfig
+    sensor: Sensor
+    number: int
+    clutter: ClutterModel | None
+    joint: bool
+    claimed: float | None
+
+    @classmethod
+    def of(cls, scenario: Scenario, number: int) -> Sight:
+        """A sensor of a scenario; bearings start no track."""
+        config, motion = scenario.sensors[number], scenario.motion.build()
+        starts = scenario.initiation is not None and config.kind != "bearing"
+        return cls(
+            config=config,
+            sensor=config.build(motion),
+            number=number,
+            clutter=config.clutter_model(motion),
+            joint=scenario.joint,
+            claimed=scenario.initiation.claimed if scenario.initiation is not None and starts else None,
+        )
+
+    @property
+    def sharing(self) -> bool:
+        """Whether it is asked which plots belong to none of the tracks."""
+        return self.claimed is not None or self.clutter is not None
+
+    def expect(self, local: LocalFilter, predicted: Mixture, position: Array, visible: Array) -> Expected:
+        """What the sensor will see of predicted tracks.
+
+        Args:
+            local: the filter that predicted them.
+            predicted: the tracks.
+            position: where the sensor will stand [m], shape (d,).
+            visible: probability of each track to be visible to it, shape (T,).
+        """
+        known = None if self.sensor.visibility is None else visible
+        return local.expect(predicted.density, self.sensor, position, self.config.view_center(position), known)
+
+    def near(
+        self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
+    ) -> tuple[Plots, Array | None]:
+        """The plots near the tracks, and the probability of each plot to be that of none; None: not asked for.
+
+        Args:
+            local: the filter of the tracks.
+            predicted: the tracks.
+            expected: the same, as the sensor will see them.
+            look: the scan.
+            log_odds: of the tracks to exist, shape (T,).
+        """
+        near = local.near(expected, look.plots, self.sensor, look.position)
+        if look.plots.z.ndim > 2 or not (self.sharing or (self.joint and len(log_odds) > 1)):
+            return near, None
+        plots, existence = len(look.plots.z), expit(log_odds)
+        shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
+        return shared if self.joint else near, free
+
+    def filter(
+        self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
+    ) -> Mixture:
+        """Tracks after a scan; arguments as for ``near``."""
+        near, _ = self.near(local, predicted, expected, look, log_odds)
+        return local.update(predicted, expected, near, self.sensor, look.position)
+
+    def look(
+        self, local: LocalFilter, tracks: Tracks, predicted: Mixture, expected: Expected, look: Look
+    ) -> tuple[Mixture, Array, Array | None]:
+        """``filter``, and what else the scan tells.
+
+        Returns:
+            the tracks; their probabilities to be visible to each sensor, shape (T, S); and of each plot to be that of
+            none, None: not asked for.
+        """
+        near, free = self.near(local, predicted, expected, look, tracks.log_odds)
+        visible = tracks.visible
+        if self.sensor.visibility is not None:
+            v, visible = visible[:, self.number], visible.copy()
+            visible[:, self.number] = local.visible(v, predicted, expected, near, self.sensor, look.position)
+        return local.update(predicted, expected, near, self.sensor, look.position), visible, free
+
+    def mapped(self, seen: ClutterMap | None, look: Look) -> Look:
+        """A scan with the density of false plots that earlier scans tell of."""
+        if self.clutter is None or seen is None or look.plots.z.ndim > 2:
+            return look
+        relative = clutter_map.log_relative(seen, self.clutter, look.plots.z, look.position)
+        return look._replace(plots=look.plots._replace(log_relative=relative))
+
+    def learned(self, seen: ClutterMap | None, look: Look, free: Array | None) -> ClutterMap | None:
+        """The map of false plots after a scan."""
+        if self.clutter is None or seen is None or free is None:
+            return seen
+        center = self.config.view_center(look.position)
+        return clutter_map.learn(seen, self.clutter, look.plots.z, free, look.time_ns, look.position, center)
+
+    def unclaimed(self, look: Look, free: Array | None) -> tuple[Look, Array]:
+        """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""
+        z = look.plots.z
+        if free is None:
+            return look, np.empty((0, z.shape[-1]))
+        with np.errstate(divide="ignore"):  # surely claimed
+            look = look._replace(log_free=np.log(free))
+        if self.claimed is None:
+            return look, np.empty((0, z.shape[-1]))
+        quiet = free > 1.0 - self.claimed
+        if look.plots.log_relative is not None and self.config.clutter_map is not None:
+            quiet &= look.plots.log_relative < np.log(self.config.clutter_map.start_below)
+        return look, z[quiet]

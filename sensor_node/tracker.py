@@ -13,8 +13,10 @@ import numpy as np
 from scipy.special import expit
 
 from common.config import Scenario, SensorConfig
+from common.estimation import clutter_map
 from common.estimation.association import Expected, Plots
 from common.estimation.batch import concatenate, take
+from common.estimation.clutter_map import ClutterMap, ClutterModel
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp
 from common.estimation.mixture import Mixture
 from common.estimation.representation import globalise, shrink
@@ -34,6 +36,7 @@ class LocalTracker:
         config: the sensor as the scenario describes it.
         sensor: the sensor model.
         sensors: models of all sensors of the network.
+        clutter: what is believed of the false plots of each that maps them; None for the others.
         number: of this sensor among them.
         filter: predicts and filters the tracks.
         feedback: the center answers every measurement time: with the fused tracks, as advice or to begin anew
@@ -51,6 +54,7 @@ class LocalTracker:
     config: SensorConfig
     sensor: Sensor
     sensors: tuple[Sensor, ...]
+    clutter: tuple[ClutterModel | None, ...]
     number: int
     filter: LocalFilter
     feedback: bool
@@ -81,6 +85,7 @@ class LocalTracker:
             config=config,
             sensor=sensors[number],
             sensors=sensors,
+            clutter=tuple(sensor.clutter_model(motion) for sensor in scenario.sensors),
             number=number,
             filter=LocalFilter.of(scenario),
             feedback=scenario.fusion.feedback != "none" or scenario.initiation is not None,
@@ -99,7 +104,10 @@ class LocalTracker:
         n, none = self.filter.motion.n, np.empty(0, np.int64)
         x, P = np.empty((0, n)), np.empty((0, n, n))
         start = Start("", epoch=0, ids=none, times_ns=none, log_p_bar=np.empty(0), x=x, P=P, x_a=x, P_a=P)
-        return State(epoch=0, sequence=0, tracks=self._fresh(start), recent=())
+        maps = tuple(
+            None if model is None else clutter_map.start(self.filter.motion.dimensions) for model in self.clutter
+        )
+        return State(epoch=0, sequence=0, tracks=self._fresh(start), recent=(), maps=maps)
 
     def prepare(self, state: State, time_ns: int, position: Array) -> State:
         """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
@@ -112,10 +120,11 @@ class LocalTracker:
 
     def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""
-        state = self._rebased(state, look.time_ns)
+        state, look = self._rebased(state, look.time_ns), self._mapped(state, look)
         ready = self._ready(state, look.time_ns, look.position)
         mixture, free = self._filtered(self.filter, ready.mixture, ready.expected, look, ready.predicted.log_odds)
         filtered = self._with(ready.predicted, mixture)
+        maps = self._learned(state, look, free)
         look, unclaimed = self._unclaimed(look, free)
         if self.rounded:
             unclaimed = unclaimed.astype(np.float32).astype(np.float64)
@@ -127,7 +136,25 @@ class LocalTracker:
         else:
             report = self._picked(state, look, next_ns, ready, self.selection, unclaimed)
         sequence, recent = state.sequence + 1, (*kept, look)
-        return state._replace(sequence=sequence, tracks=tracks, recent=recent, advice=advice, ready=None), report
+        state = state._replace(sequence=sequence, tracks=tracks, recent=recent, advice=advice, maps=maps, ready=None)
+        return state, report
+
+    def _mapped(self, state: State, look: Look) -> Look:
+        """The scan with the density of false plots that earlier scans tell of."""
+        model, seen = self.clutter[self.number], state.maps[self.number]
+        if model is None or seen is None or look.plots.z.ndim > 2:
+            return look
+        relative = clutter_map.log_relative(seen, model, look.plots.z, look.position)
+        return look._replace(plots=look.plots._replace(log_relative=relative))
+
+    def _learned(self, state: State, look: Look, free: Array | None) -> tuple[ClutterMap | None, ...]:
+        """The maps after a scan."""
+        model, seen = self.clutter[self.number], state.maps[self.number]
+        if model is None or seen is None or free is None:
+            return state.maps
+        center = self.config.view_center(look.position)
+        seen = clutter_map.learn(seen, model, look.plots.z, free, look.time_ns, look.position, center)
+        return (*state.maps[: self.number], seen, *state.maps[self.number + 1 :])
 
     def _unclaimed(self, look: Look, free: Array | None) -> tuple[Look, Array]:
         """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""
@@ -136,8 +163,11 @@ class LocalTracker:
             return look, np.empty((0, z.shape[-1]))
         if free is None:
             return look, z
+        quiet = free > 1.0 - self.claimed
+        if look.plots.log_relative is not None and self.config.clutter_map is not None:
+            quiet &= look.plots.log_relative < np.log(self.config.clutter_map.start_below)
         with np.errstate(divide="ignore"):  # surely claimed
-            return look._replace(log_free=np.log(free)), z[free > 1.0 - self.claimed]
+            return look._replace(log_free=np.log(free)), z[quiet]
 
     def _picked(
         self, state: State, look: Look, next_ns: int, ready: Ready, selection: Selection, unclaimed: Array
@@ -329,12 +359,17 @@ class LocalTracker:
     ) -> tuple[Mixture, Array | None]:
         """Tracks after a scan, and the probability of each plot to be that of none; None: not asked for."""
         near, free = local.near(expected, look.plots, self.sensor, look.position), None
-        wanted = self.claimed is not None or (self.joint and len(log_odds) > 1)
+        wanted = self._existence_counts or (self.joint and len(log_odds) > 1)
         if wanted and look.plots.z.ndim == 2:
             plots, existence = len(look.plots.z), expit(log_odds)
             shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
             near = shared if self.joint else near
         return local.update(predicted, expected, near, self.sensor, look.position), free
+
+    @property
+    def _existence_counts(self) -> bool:
+        """Whether what plots belong to none of the tracks is asked for."""
+        return self.claimed is not None or self.clutter[self.number] is not None
 
     def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
         mixture = self._mixture(tracks)
@@ -388,7 +423,7 @@ class LocalTracker:
 
     def _believed(self, tracks: Tracks, log_g: Array) -> Array:
         """Log odds of existence after the evidence since, where they are asked for."""
-        if not self.joint and self.claimed is None:
+        if not self.joint and not self._existence_counts:
             return tracks.log_odds
         with np.errstate(invalid="ignore"):  # what was impossible stays so
             gain = log_sum_exp(log_g) - log_sum_exp(tracks.log_g)

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import Field
 
+from common.estimation.clutter_map import ClutterModel
 from common.estimation.detection import Constant, Detection, Notch, Swerling
 from common.estimation.field_of_view import AllAround, Box, Disc, Everywhere, FieldOfView
 from common.estimation.gaussian import Array
@@ -175,6 +176,22 @@ class VisibilityConfig(Model):
         return Visibility(self.visible_for, self.hidden_for)
 
 
+class ClutterMapConfig(Model):
+    """Where false plots come from, learned from the plots themselves.
+
+    Attributes:
+        cell: side of a cell [m], of a bearing sensor [rad]: about twice the standard deviation of a plot.
+        memory: after so long a scan counts 1/e [s].
+        shape: of the Gamma prior of the rate in a cell: the smaller, the more false plots keep to places of their own.
+        start_below: a plot starts a track only where false plots are less than so many times as dense as on average.
+    """
+
+    cell: Positive
+    memory: Positive = 60.0
+    shape: Positive = 0.1
+    start_below: Positive = 10.0
+
+
 class SensorConfig(Model):
     """One sensor: where it stands, what it measures, how surely, and when.
 
@@ -187,6 +204,7 @@ class SensorConfig(Model):
         detection: how the detection probability depends on the target.
         visibility: how long targets stay visible and hidden to this sensor; default: visible all the time.
         false_plots: mean false plots per scan, uniform in the field of view.
+        clutter_map: learns where they are denser and where less; without it they are uniform.
         max_speed: of polar-doppler: false plots have range rates uniform between its negative and itself [m/s].
         update: how plots that are not linear in the state are worked in.
         scan_interval: seconds between scans.
@@ -203,6 +221,7 @@ class SensorConfig(Model):
     detection: DetectionConfig = ConstantConfig()
     visibility: VisibilityConfig | None = None
     false_plots: FalsePlots
+    clutter_map: ClutterMapConfig | None = None
     max_speed: Positive | None = None
     update: Literal["ekf", "sigma-point"] = "ekf"
     field_of_view: FieldOfViewConfig
@@ -219,6 +238,13 @@ class SensorConfig(Model):
             self.field_of_view.build(motion.dimensions),
             self.detection.build(),
             None if self.visibility is None else self.visibility.build(),
+        )
+
+    def clutter_model(self, motion: Motion) -> ClutterModel | None:
+        """What is believed of the false plots of a sensor that maps them, for states of a motion model."""
+        learned = self.clutter_map
+        return (
+            None if learned is None else ClutterModel(self.build(motion), learned.cell, learned.memory, learned.shape)
         )
 
     def _measurement(self, motion: Motion) -> Measurement:

@@ -53,7 +53,7 @@ class NodeShell:
         """
         self._bus, self._network, self._tracker, self._scans = bus, network, tracker, scans
         self._patience_ns = round(patience_s * 1e9)
-        self._name = tracker.config.name
+        self._name = tracker.name
         self._log: structlog.typing.FilteringBoundLogger = structlog.get_logger().bind(sensor=self._name)
         self.complaints = Complaints(self._log)
         self._inbox = inbox or Inbox()
@@ -101,7 +101,7 @@ class NodeShell:
             self._keys.join(self._name): self._bus.publisher(self._keys.join(self._name)),
             self._keys.plots(self._name): self._bus.publisher(self._keys.plots(self._name), reliable=False),
         }
-        about = json.dumps(self._tracker.config.model_dump(mode="json")).encode()
+        about = json.dumps(self._tracker.sights[self._tracker.number].config.model_dump(mode="json")).encode()
         self._bus.answer(self._keys.about(self._name), lambda: about)
         self._bus.announce(self._keys.sensor_alive(self._name))
         self._bus.watch(self._keys.center_alive(), self._inbox.present)

@@ -9,6 +9,7 @@ import numpy as np
 
 from common.estimation.association import Expected, Plots
 from common.estimation.batch import put
+from common.estimation.clutter_map import ClutterMap
 from common.estimation.gaussian import Array, BoolArray
 from common.estimation.mixture import Mixture
 from common.messages import Advice, Begin, IntArray, Rebase
@@ -82,7 +83,8 @@ class Look(NamedTuple):
     Attributes:
         time_ns: of the scan.
         position: where the sensor stood [m], shape (d,).
-        plots: that all tracks share; in a study, where all tracks start together, of every track its own.
+        plots: that all tracks share, with the density of false ones as the map had it then; in a study, where all
+            tracks start together, of every track its own.
         number: of the sensor in the scenario.
         log_free: log probability of each plot to belong to none of the tracks there were; None: not told.
     """
@@ -107,6 +109,7 @@ class State(NamedTuple):
         rebases: told, and not followed yet.
         next_id: tracks with lower ids, which the start message did not name, are no more.
         begun: tracks that began at a center whose start message has not come yet.
+        maps: of each sensor's false plots; None for sensors that have none.
         ready: worked out ahead for the next scan, or None. It saves time and changes nothing.
     """
 
@@ -119,6 +122,7 @@ class State(NamedTuple):
     rebases: tuple[Rebase, ...] = ()
     next_id: int = 0
     begun: tuple[Begin, ...] = ()
+    maps: tuple[ClutterMap | None, ...] = ()
     ready: Ready | None = None
 
 
@@ -136,7 +140,11 @@ class Schedule(NamedTuple):
 
 def left(look: Look) -> Look:
     """A scan for tracks that begin later: false plots are the denser, the more the others claim them."""
-    return look if look.log_free is None else look._replace(plots=look.plots._replace(log_relative=-look.log_free))
+    if look.log_free is None:
+        return look
+    relative = look.plots.log_relative
+    more = -look.log_free if relative is None else relative - look.log_free
+    return look._replace(plots=look.plots._replace(log_relative=more))
 
 
 def put_tracks(tracks: Tracks, rows: BoolArray, part: Tracks) -> Tracks:

@@ -90,7 +90,9 @@ class LocalTracker:
         n, none = self.filter.motion.n, np.empty(0, np.int64)
         x, P = np.empty((0, n)), np.empty((0, n, n))
         start = Start("", epoch=0, ids=none, times_ns=none, log_p_bar=np.empty(0), x=x, P=P, x_a=x, P_a=P)
-        maps = tuple(None if sight.clutter is None else clutter_map.start(n) for sight in self.sights)
+        maps = tuple(
+            None if sight.clutter is None else clutter_map.start(self.filter.motion.dimensions) for sight in self.sights
+        )
         return State(epoch=0, sequence=0, tracks=self._fresh(start), recent=(), maps=maps)
 
     def prepare(self, state: State, time_ns: int, position: Array) -> State:
@@ -142,7 +144,7 @@ class LocalTracker:
         if self.rounded:
             z = z.astype(np.float32).astype(np.float64)
         return Picked(
-            sensor=self.configs[look.number].name,
+            sensor=self.sights[look.number].config.name,
             sequence=state.sequence,
             time_ns=look.time_ns,
             next_ns=next_ns,
@@ -164,7 +166,7 @@ class LocalTracker:
         if self.rounded:
             x, P = x.astype(np.float32).astype(np.float64), P.astype(np.float32).astype(np.float64)
         return Report(
-            sensor=self.configs[look.number].name,
+            sensor=self.sights[look.number].config.name,
             sequence=state.sequence,
             time_ns=look.time_ns,
             next_ns=next_ns,
@@ -174,7 +176,7 @@ class LocalTracker:
             log_g=mixture.log_g[there],
             x=x,
             P=P,
-            position=look.position if self._claimed(look.number) is not None else np.empty(0),
+            position=look.position if self.sights[look.number].claimed is not None else np.empty(0),
             unclaimed=unclaimed,
         )
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from builders import hypothesis_table, only, scenario, sensor_table
-from pydantic import ValidationError
 
-from common.config import Scenario
+from common.config import Scenario, load_scenario
 from common.errors import ConfigError
 from common.estimation.visibility import Visibility, seen
 from common.messages import Scan, Tracks
@@ -19,6 +20,19 @@ from studies.replay import Replay
 LOSES = {"visible_for": 12.0, "hidden_for": 6.0}
 #: Covers all: every target is inside.
 FAR = {"shape": "box", "center": [0.0, 0.0], "size": [1e6, 1e6]}
+
+LOST_TOML = """
+name = "lost"
+motion = {{ psd = 1.0 }}
+fusion = {{ mode = "{mode}" }}
+[[sensor]]
+name = "a"
+sigma = [50.0, 50.0]
+p_d = 0.9
+visibility = {{ visible_for = 12.0, hidden_for = 6.0 }}
+false_plots = 1.0
+field_of_view = {{ shape = "disc", radius = 5000.0 }}
+"""
 
 
 def log_lr(plot: Scenario, scans: list[Scan]) -> list[float]:
@@ -86,9 +100,11 @@ def test_simulated_targets_are_lost_in_rows() -> None:
 
 
 @pytest.mark.parametrize("mode", ["dkf", "selected"])
-def test_modes_that_know_no_visibility_refuse_it(mode: str) -> None:
-    with pytest.raises(ValidationError, match=f"sensor.0.visibility: mode '{mode}' takes targets for visible"):
-        scenario(sensor_table("a", visibility=LOSES), fusion={"mode": mode})
+def test_modes_that_know_no_visibility_refuse_it(tmp_path: Path, mode: str) -> None:
+    path = tmp_path / "lost.toml"
+    path.write_text(LOST_TOML.format(mode=mode), encoding="utf-8")
+    with pytest.raises(ConfigError, match=f"sensor.0.visibility: mode '{mode}' takes targets for visible all the time"):
+        load_scenario(path)
 
 
 def test_studies_refuse_it() -> None:
@@ -102,7 +118,7 @@ def test_scans_that_come_too_soon_are_passed_over() -> None:
     spaced = scenario(sensor_table("a", scan_interval=0.5, spacing=1.2), sensor_table("b"))
     kept = all_scans(spaced, seed=3)
     times = [spaced.to_seconds(scan.time_ns) for scan in kept if scan.sensor == "a"]
-    assert times == pytest.approx(np.arange(0.5, 20.0, 1.5))
+    assert times == pytest.approx(np.arange(0.5, 20.1, 1.5))
     assert [scan.time_ns for scan in kept if scan.sensor == "b"] == [
         scan.time_ns for scan in simulate_all(whole, 3) if scan.sensor == "b"
     ]

@@ -73,7 +73,7 @@ def run(
         seed=seed_of(loaded, seed),
         speed=speed,
         out=out or Path("runs") / f"{loaded.name}-{stamp}",
-        end_ns=scans[-1].time_ns if scans else loaded.epoch_ns,
+        scans=scans,
     )
     execute(order, Console(stderr=False, highlight=False))
 

@@ -147,6 +147,19 @@ def test_a_hypothesis_counts_from_its_start_on() -> None:
     assert [tracks.log_lr_total.tolist() == [0.0] for tracks in found[1:3]] == [True, False]
     for theirs, ours in zip(pictures(Replay(at, scans).run()), found, strict=True):
         np.testing.assert_array_equal(theirs.contributing, ours.contributing)
+    later = pictures(centralised(at, [scan for scan in scans if at.to_seconds(scan.time_ns) > 4.0]))
+    np.testing.assert_array_equal(found[-1].log_lr_total, later[-1].log_lr_total)
+
+
+def test_a_track_that_has_ended_claims_nothing() -> None:
+    plot = boats(sensor_table("a"), sensor_table("b", first_scan=1.0))
+    steps = Centralised.of(plot)
+    state, ended = steps.initial(), set[int]()
+    for scan in simulate_all(plot, 5):
+        state, said = steps.step(state, [scan])
+        assert not ended & set(state.filtered.tracks.ids.tolist())
+        ended |= {decision.track for decision in decisions(said) if decision.kind in ("deleted", "merged")}
+    assert len(ended) > 10
 
 
 @pytest.mark.parametrize(

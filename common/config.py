@@ -30,6 +30,7 @@ from common.quantities import (
     Model,
     Name,
     Positive,
+    Probability,
     Seconds,
 )
 from common.sensor_config import BoxConfig as BoxConfig
@@ -122,6 +123,20 @@ class TargetConfig(Model):
     hypothesis: Count | None = None
 
 
+class ClutterSourceConfig(Model):
+    """A simulated thing that stands still and is no target: a buoy, a part of a quay.
+
+    Attributes:
+        position: east, north (, up) [m].
+        p_d: probability that a sensor that has it in its field of view gives a plot of it, scan by scan.
+        sensors: names of those that see it; default: all.
+    """
+
+    position: tuple[Finite, ...]
+    p_d: Probability
+    sensors: tuple[Name, ...] | None = None
+
+
 class HypothesisConfig(Model):
     """A track to be decided on: start [s], mean and standard deviations of a state as ``TargetConfig`` has it."""
 
@@ -154,6 +169,7 @@ class Scenario(Model):
     simulation: SimulationConfig | None = None
     study: StudyConfig = StudyConfig()
     recording: RecordingConfig | None = None
+    clutter_sources: Annotated[tuple[ClutterSourceConfig, ...], Field(alias="clutter_source")] = ()
     targets: Annotated[tuple[TargetConfig, ...], Field(alias="target")] = ()
     hypotheses: Annotated[tuple[HypothesisConfig, ...], Field(alias="hypothesis")] = ()
 
@@ -316,15 +332,31 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
     yield from initiation_faults(data.get("initiation"), _table(data, "fusion").get("window", 10.0), kinds)
     yield from fusion_faults(_table(data, "fusion"), motion.get("model"))
     yield from _mode_faults(_table(data, "fusion").get("mode"), sensors)
+    yield from _source_faults(_tables(data, "clutter_source"), sensors, dimensions)
 
 
 def _mode_faults(mode: Any, sensors: list[Mapping[str, Any]]) -> Iterator[str]:
-    """Sensors that a mode knows nothing of."""
+    """What a mode of fusion cannot do with the sensors there are."""
     if mode == "dkf":
         yield from _dkf_faults(sensors)
-    for i, sensor in enumerate(sensors if mode in ("dkf", "selected") else ()):
-        if "visibility" in sensor:
+    for i, sensor in enumerate(sensors):
+        if mode == "selected" and "clutter_map" in sensor:
+            yield f"fusion.mode: 'selected' associates at the center, which has no clutter_map; sensor.{i} has one"
+        if mode in ("dkf", "selected") and "visibility" in sensor:
             yield f"sensor.{i}.visibility: mode {mode!r} takes targets for visible all the time; leave it out"
+
+
+def _source_faults(
+    sources: list[Mapping[str, Any]], sensors: list[Mapping[str, Any]], dimensions: Any
+) -> Iterator[str]:
+    names = {sensor.get("name") for sensor in sensors if isinstance(sensor.get("name"), str)}
+    for i, source in enumerate(sources):
+        if dimensions in (2, 3):
+            yield from wrong_length(source, ("position",), dimensions, f"clutter_source.{i}")
+        seeing = source.get("sensors")
+        for name in seeing if isinstance(seeing, list) else ():
+            if name not in names:
+                yield f"clutter_source.{i}.sensors: {name!r} is no sensor of this scenario"
 
 
 def _dkf_faults(sensors: list[Mapping[str, Any]]) -> Iterator[str]:

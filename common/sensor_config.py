@@ -38,6 +38,8 @@ from common.quantities import (
 
 #: Range rates of false plots reach so far unless the file says otherwise [m/s].
 _MAX_SPEED = 300.0
+#: A circle has four cells of directions at least [rad].
+_LARGEST_CELL = 0.5 * np.pi
 _NUMBERS = {
     "position": ("east", "north", "up"),
     "polar": ("range", "azimuth", "elevation"),
@@ -305,12 +307,20 @@ def sensor_faults(sensor: Mapping[str, Any], dimensions: int, where: str) -> Ite
         yield f"{where}.update: 'sigma-point' is for plots that are not linear in the state; a position is"
     if kind != "polar-doppler" and "max_speed" in sensor:
         yield f"{where}.max_speed: only a polar-doppler sensor has it, this one is {kind}"
+    yield from _map_faults(sensor.get("clutter_map"), kind, f"{where}.clutter_map")
     detection = sensor.get("detection")
     swerling = isinstance(detection, dict) and detection.get("model") == "swerling"
     if swerling and "p_d" in sensor:
         yield f"{where}.p_d: detection 'swerling' says how probable a detection is; leave it out"
     elif not swerling and "p_d" not in sensor:
         yield f"{where}.p_d: is missing"
+
+
+def _map_faults(learned: Any, kind: str, where: str) -> Iterator[str]:
+    """Faults of a map of false plots."""
+    cell = learned.get("cell", 0.0) if isinstance(learned, dict) else 0.0
+    if kind == "bearing" and _number(cell) and cell > _LARGEST_CELL:
+        yield f"{where}.cell: {cell:g} is no side of a cell of directions in radians (up to pi/2)"
 
 
 def _view_faults(view: Mapping[str, Any], kind: str, dimensions: int, where: str) -> Iterator[str]:

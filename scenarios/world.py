@@ -8,11 +8,12 @@ with any seed.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from common.config import Scenario, SensorConfig, TargetConfig
+from common.config import ClutterSourceConfig, Scenario, SensorConfig, TargetConfig
 from common.errors import ConfigError
 from common.estimation.gaussian import Array, BoolArray, draw_noise
 from common.estimation.imm import draw_path
@@ -104,8 +105,9 @@ def simulate(scenario: Scenario, name: str, seed: int, world: Truth | None = Non
     sensor, stand = config.build(scenario.motion.build()), config.stand(scenario.motion.dimensions)
     center = config.view_center(stand)
     states = np.where(_visible(sensor, len(states), times_ns, seed, name)[..., None], states, np.nan)
+    sources = [source for source in scenario.clutter_sources if source.sensors is None or name in source.sensors]
     return [
-        Scan(name, int(t_ns), stand, _plots(sensor, stand, center, states[:, k], rng))
+        Scan(name, int(t_ns), stand, _plots(sensor, stand, center, states[:, k], sources, rng))
         for k, t_ns in enumerate(times_ns)
     ]
 
@@ -119,15 +121,42 @@ def _visible(sensor: Sensor, targets: int, times_ns: IntArray, seed: int, name: 
     return np.array([sensor.visibility.draw(rng, dt) for rng in rngs]).reshape(targets, -1)
 
 
-def _plots(sensor: Sensor, stand: Array, center: Array, states: Array, rng: np.random.Generator) -> Array:
-    """Plots of one scan: of the targets that are detected, and false ones, in random order, shape (M, m)."""
+def _plots(
+    sensor: Sensor,
+    stand: Array,
+    center: Array,
+    states: Array,
+    sources: Sequence[ClutterSourceConfig],
+    rng: np.random.Generator,
+) -> Array:
+    """Plots of one scan: of targets and clutter sources that are detected, and false ones, in random order, (M, m)."""
     measurement = sensor.measurement
     there = states[~np.isnan(states).any(axis=-1)]
     seen = there[sensor.draw_seen(rng, there, stand, center)]
     noise = draw_noise(rng, measurement.R, len(seen))
     places = sensor.field_of_view.draw(rng, int(rng.poisson(sensor.false_plots)), center)
     true = measurement.fold(measurement.observe(seen, stand) + noise)
-    return rng.permutation(np.concatenate([true, measurement.draw_false(rng, places, stand)]))
+    false = measurement.draw_false(rng, places, stand)
+    if sources:
+        false = np.concatenate([false, _of_sources(sensor, stand, center, sources, states.shape[-1], rng)])
+    return rng.permutation(np.concatenate([true, false]))
+
+
+def _of_sources(
+    sensor: Sensor,
+    stand: Array,
+    center: Array,
+    sources: Sequence[ClutterSourceConfig],
+    n: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Plots of things that stand still, shape (M, m)."""
+    still = np.zeros((len(sources), n))
+    still[:, : len(stand)] = [source.position for source in sources]
+    p_d = np.array([source.p_d for source in sources])
+    seen = still[sensor.field_of_view.contains(still[:, : len(stand)], center) & (rng.random(len(p_d)) < p_d)]
+    noise = draw_noise(rng, sensor.measurement.R, len(seen))
+    return sensor.measurement.fold(sensor.measurement.observe(seen, stand) + noise)
 
 
 def simulate_all(scenario: Scenario, seed: int) -> list[Scan]:

@@ -84,9 +84,19 @@ class Sight:
         near = local.near(expected, look.plots, self.sensor, look.position)
         if look.plots.z.ndim > 2 or not (self.sharing or (self.joint and len(log_odds) > 1)):
             return near, None
-        plots, existence = len(look.plots.z), expit(log_odds)
+        plots, existence = len(look.plots.z), self._existence(log_odds)
         shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
         return shared if self.joint else near, free
+
+    def _existence(self, log_odds: Array) -> Array:
+        """Probability of tracks to exist, before a scan.
+
+        What a sensor that starts no tracks is told of, others have found: by itself it holds that for no less probable
+        than not, or its map would take the plots of a target that was late to be found for false ones for ever.
+        """
+        if self.claimed is None and self.clutter is not None:
+            log_odds = np.where(log_odds > -np.inf, np.maximum(log_odds, 0.0), log_odds)
+        return np.asarray(expit(log_odds))
 
     def filter(
         self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array

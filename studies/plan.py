@@ -157,6 +157,8 @@ def _scenario_faults(scenario: Scenario) -> Iterator[str]:
         yield f"{scenario.name}: has no [simulation]; a study draws its worlds, give a duration"
     elif scenario.simulation.truth is not None:
         yield f"{scenario.name}: simulation.truth: a study draws its targets, recorded ones are the same in every world"
+    if scenario.clutter_sources or any(sensor.clutter_map is not None for sensor in scenario.sensors):
+        yield f"{scenario.name}: has clutter_source or clutter_map; the false plots of a study are uniform"
     if not scenario.hypotheses:
         yield f"{scenario.name}: has no [[hypothesis]]; a study follows the track of hypothesis 0"
     elif scenario.simulation is not None:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array
+from common.estimation.gaussian import Array, Gaussian
 from common.estimation.sensing import Sensor
 
 #: What has faded below this share of the prior's shape, or of a scan, is dropped.
@@ -51,12 +51,17 @@ class ClutterModel(NamedTuple):
         """Sides of a cell, shape (axes,): [m], or [rad] of azimuth and of the sine of elevation."""
         if not self.angular(d):
             return np.full(d, self.cell)
-        return np.array([2.0 * np.pi / self.around, self.cell][: d - 1])
+        return np.array([2.0 * np.pi / self.around, 2.0 / self.upward][: d - 1])
 
     @property
     def around(self) -> int:
         """Cells around the circle of azimuths."""
         return max(round(2.0 * np.pi / self.cell), 1)
+
+    @property
+    def upward(self) -> int:
+        """Cells from nadir to zenith."""
+        return max(round(2.0 / self.cell), 1)
 
     def prior_rate(self, d: int) -> float:
         """Mean number of false plots per scan and cell, before any."""
@@ -109,9 +114,7 @@ def log_relative(seen: ClutterMap, model: ClutterModel, z: Array, stand: Array) 
     if model.angular(d):
         scans = np.full(len(z), seen.scans.sum())
     else:
-        places = (index + 0.5) * model.sides(d)
-        visible = model.sensor.field_of_view.contains(places, seen.centers[:, None, None])
-        scans = np.tensordot(seen.scans, np.vecdot(visible.astype(np.float64), share), axes=1)
+        scans = np.tensordot(seen.scans, np.vecdot(_visible(model, index, seen.centers), share), axes=1)
     relative: Array = np.log(model.shape + counts) - np.log(model.shape + model.prior_rate(d) * scans)
     return relative
 
@@ -151,7 +154,7 @@ def _around(model: ClutterModel, z: Array, stand: Array) -> tuple[IntArray, Arra
     places = model.sensor.measurement.locate(z, stand)
     if model.angular(d):
         way = places - stand
-        places = np.column_stack([np.arctan2(way[:, 0], way[:, 1]), way[:, 2:]])
+        places = np.column_stack([np.arctan2(way[:, 0], way[:, 1]), 1.0 + way[:, 2:]])
     at = places / model.sides(d) - 0.5
     low = np.floor(at)
     corners = np.array(list(product((0, 1), repeat=at.shape[-1])))
@@ -160,7 +163,19 @@ def _around(model: ClutterModel, z: Array, stand: Array) -> tuple[IntArray, Arra
     index = low[:, None].astype(np.int64) + corners
     if model.angular(d):
         index[..., 0] %= model.around
+        # Beyond nadir and zenith is nothing: the last cell has it all.
+        index[..., 1:] = np.clip(index[..., 1:], 0, model.upward - 1)
     return index, share
+
+
+def _visible(model: ClutterModel, index: IntArray, centers: Array) -> Array:
+    """How much of what counts in a cell is in the field of view from each center, shape (V, M, K)."""
+    d = index.shape[-1]
+    # A plot that counts in a cell lies within one side of its middle, the probability falling linearly.
+    middle: Array = np.asarray((index + 0.5) * model.cell, np.float64)
+    places = Gaussian(middle, np.eye(d) * model.cell**2 / 6.0)
+    inside = [model.sensor.field_of_view.probability_inside(places, center) for center in centers]
+    return np.array(inside).reshape(len(centers), *index.shape[:-1])
 
 
 def _numbers(index: IntArray) -> IntArray:

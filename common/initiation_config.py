@@ -18,6 +18,7 @@ class InitiationConfig(Model):
         plots: a track starts from one plot, or from two of any sensors.
         speed: standard deviation of each component of a target's velocity [m/s].
         acceleration: the same of its acceleration, where motion has one [m/s^2].
+        min_speed: targets are faster [m/s]: the plots that a slower track claims are false ones to a clutter map.
         max_speed: no target is faster [m/s]; default: three times ``speed``.
         within: two plots that start a track lie no farther apart in time [s].
         claimed: a plot that belongs to the tracks with at least this probability starts none.
@@ -29,6 +30,7 @@ class InitiationConfig(Model):
     plots: Literal[1, 2] = 1
     speed: Positive
     acceleration: Positive = 1.0
+    min_speed: NotNegative = 0.0
     max_speed: Positive | None = None
     within: Positive = 5.0
     claimed: Probability = 0.5

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,18 @@ from common.estimation.visibility import seen
 HONEST = Share(1.0)
 #: Log odds of existence go no farther than this, so that a target that has gone is soon believed to be.
 SUREST = 7.0
+
+
+class Left(NamedTuple):
+    """What tracks leave of the plots of a scan.
+
+    Attributes:
+        free: probability of each plot to be that of none of them, shape (plots,).
+        false: of none that is a target, shape (plots,).
+    """
+
+    free: Array
+    false: Array
 
 
 @dataclass(frozen=True)
@@ -191,7 +204,8 @@ class LocalFilter:
         sensor: Sensor,
         stand: Array,
         existence: Array,
-    ) -> tuple[Plots, Array]:
+        target: Array | None = None,
+    ) -> tuple[Plots, Left]:
         """Associate tracks that share the plots of a scan (Eq. 21).
 
         Args:
@@ -202,15 +216,15 @@ class LocalFilter:
             sensor: the sensor model.
             stand: where it stands [m], shape (d,).
             existence: probability of each track to exist, before the scan, shape (T,).
+            target: probability of each track to be that of a target, if it exists, shape (T,); None: all are.
 
         Returns:
-            the plots, false ones the denser the more the other tracks claim them; and the probability of each plot of
-            the scan to be that of none of the tracks, shape (plots,).
+            the plots, false ones the denser the more the other tracks claim them; and what these leave.
         """
         alone = _log_p_star(expected, near, sensor, stand)
-        log_nu, unclaimed = joint(predicted.log_w, alone, near.number, plots, existence)
+        log_nu, *left = joint(predicted.log_w, alone, near.number, plots, existence, target)
         log_relative = -log_nu if near.log_relative is None else near.log_relative - log_nu
-        return near._replace(log_relative=log_relative), unclaimed
+        return near._replace(log_relative=log_relative), Left(*left)
 
     def visible(
         self, v: Array, predicted: Mixture, expected: Expected, near: Plots, sensor: Sensor, stand: Array

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import expit, ndtr
 
 from common.config import Scenario, SensorConfig
 from common.estimation import clutter_map
@@ -14,7 +14,7 @@ from common.estimation.clutter_map import ClutterMap, ClutterModel
 from common.estimation.gaussian import Array
 from common.estimation.mixture import Mixture
 from common.estimation.sensing import Sensor
-from common.local_filter import LocalFilter
+from common.local_filter import Left, LocalFilter
 from sensor_node.state import Look, Tracks
 
 
@@ -29,6 +29,7 @@ class Sight:
         clutter: what is believed of its false plots, if it maps them; else None.
         joint: tracks that share plots are associated jointly (Eq. 21).
         claimed: a plot that belongs to the tracks with at least this probability starts none; None: none does.
+        min_speed: targets are faster [m/s].
     """
 
     config: SensorConfig
@@ -37,19 +38,21 @@ class Sight:
     clutter: ClutterModel | None
     joint: bool
     claimed: float | None
+    min_speed: float
 
     @classmethod
     def of(cls, scenario: Scenario, number: int) -> Sight:
         """A sensor of a scenario; bearings start no track."""
         config, motion = scenario.sensors[number], scenario.motion.build()
-        starts = scenario.initiation is not None and config.kind != "bearing"
+        initiation = scenario.initiation
         return cls(
             config=config,
             sensor=config.build(motion),
             number=number,
             clutter=config.clutter_model(motion),
             joint=scenario.joint,
-            claimed=scenario.initiation.claimed if scenario.initiation is not None and starts else None,
+            claimed=None if initiation is None or config.kind == "bearing" else initiation.claimed,
+            min_speed=0.0 if initiation is None else initiation.min_speed,
         )
 
     @property
@@ -71,8 +74,8 @@ class Sight:
 
     def near(
         self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
-    ) -> tuple[Plots, Array | None]:
-        """The plots near the tracks, and the probability of each plot to be that of none; None: not asked for.
+    ) -> tuple[Plots, Left | None]:
+        """The plots near the tracks, and what these leave; None: not asked for.
 
         Args:
             local: the filter of the tracks.
@@ -85,8 +88,9 @@ class Sight:
         if look.plots.z.ndim > 2 or not (self.sharing or (self.joint and len(log_odds) > 1)):
             return near, None
         plots, existence = len(look.plots.z), self._existence(log_odds)
-        shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
-        return shared if self.joint else near, free
+        target = _moving(predicted, len(look.position), self.min_speed) if self.min_speed > 0.0 else None
+        shared, left = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence, target)
+        return shared if self.joint else near, left
 
     def _existence(self, log_odds: Array) -> Array:
         """Probability of tracks to exist, before a scan.
@@ -107,19 +111,19 @@ class Sight:
 
     def look(
         self, local: LocalFilter, tracks: Tracks, predicted: Mixture, expected: Expected, look: Look
-    ) -> tuple[Mixture, Array, Array | None]:
+    ) -> tuple[Mixture, Array, Left | None]:
         """``filter``, and what else the scan tells.
 
         Returns:
-            the tracks; their probabilities to be visible to each sensor, shape (T, S); and of each plot to be that of
-            none, None: not asked for.
+            the tracks; their probabilities to be visible to each sensor, shape (T, S); and what they leave of the
+            plots, None: not asked for.
         """
-        near, free = self.near(local, predicted, expected, look, tracks.log_odds)
+        near, left = self.near(local, predicted, expected, look, tracks.log_odds)
         visible = tracks.visible
         if self.sensor.visibility is not None:
             v, visible = visible[:, self.number], visible.copy()
             visible[:, self.number] = local.visible(v, predicted, expected, near, self.sensor, look.position)
-        return local.update(predicted, expected, near, self.sensor, look.position), visible, free
+        return local.update(predicted, expected, near, self.sensor, look.position), visible, left
 
     def mapped(self, seen: ClutterMap | None, look: Look) -> Look:
         """A scan with the density of false plots that earlier scans tell of."""
@@ -128,23 +132,32 @@ class Sight:
         relative = clutter_map.log_relative(seen, self.clutter, look.plots.z, look.position)
         return look._replace(plots=look.plots._replace(log_relative=relative))
 
-    def learned(self, seen: ClutterMap | None, look: Look, free: Array | None) -> ClutterMap | None:
+    def learned(self, seen: ClutterMap | None, look: Look, left: Left | None) -> ClutterMap | None:
         """The map of false plots after a scan."""
-        if self.clutter is None or seen is None or free is None:
+        if self.clutter is None or seen is None or left is None:
             return seen
         center = self.config.view_center(look.position)
-        return clutter_map.learn(seen, self.clutter, look.plots.z, free, look.time_ns, look.position, center)
+        return clutter_map.learn(seen, self.clutter, look.plots.z, left.false, look.time_ns, look.position, center)
 
-    def unclaimed(self, look: Look, free: Array | None) -> tuple[Look, Array]:
+    def unclaimed(self, look: Look, left: Left | None) -> tuple[Look, Array]:
         """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""
         z = look.plots.z
-        if free is None:
+        if left is None:
             return look, np.empty((0, z.shape[-1]))
         with np.errstate(divide="ignore"):  # surely claimed
-            look = look._replace(log_free=np.log(free))
+            look = look._replace(log_free=np.log(left.free))
         if self.claimed is None:
             return look, np.empty((0, z.shape[-1]))
-        quiet = free > 1.0 - self.claimed
+        quiet = left.free > 1.0 - self.claimed
         if look.plots.log_relative is not None and self.config.clutter_map is not None:
             quiet &= look.plots.log_relative < np.log(self.config.clutter_map.start_below)
         return look, z[quiet]
+
+
+def _moving(predicted: Mixture, d: int, min_speed: float) -> Array:
+    """Probability of each track to be faster than ``min_speed`` [m/s], along its estimated course, shape (T,)."""
+    w, (x, P) = np.exp(predicted.log_w), predicted.density
+    velocity = np.vecmat(w, x[-1, ..., d : 2 * d])
+    variance = np.vecdot(w, P[-1].diagonal(axis1=-2, axis2=-1)[..., d : 2 * d].mean(axis=-1))
+    faster: Array = ndtr((np.linalg.vector_norm(velocity, axis=-1) - min_speed) / np.sqrt(variance))
+    return faster

@@ -110,12 +110,12 @@ class LocalTracker:
         sight, state = self.sights[look.number], self._rebased(state, look.time_ns)
         look = sight.mapped(state.maps[look.number], look)
         ready = self._ready(state, look.time_ns, look.position, look.number)
-        mixture, visible, free = sight.look(self.filter, ready.predicted, ready.mixture, ready.expected, look)
+        mixture, visible, rest = sight.look(self.filter, ready.predicted, ready.mixture, ready.expected, look)
         filtered = self._with(ready.predicted, mixture)._replace(visible=visible)
         maps = tuple(
-            sight.learned(seen, look, free) if number == look.number else seen for number, seen in enumerate(state.maps)
+            sight.learned(seen, look, rest) if number == look.number else seen for number, seen in enumerate(state.maps)
         )
-        look, unclaimed = sight.unclaimed(look, free)
+        look, unclaimed = sight.unclaimed(look, rest)
         if self.rounded:
             unclaimed = unclaimed.astype(np.float32).astype(np.float64)
         tracks = filtered if ready.live.all() else put_tracks(ready.advised, ready.live, filtered)

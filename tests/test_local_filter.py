@@ -319,5 +319,5 @@ def test_twins_share_a_plot(radar: dict[str, Any], motion: dict[str, Any], fusio
     np.testing.assert_allclose(p_bar(two, z, r), none + nu * hit, rtol=1e-9)
     expected = local.expect(two.density, sensor, stand, center)
     near = local.near(expected, Plots(z), sensor, stand)
-    _, unclaimed = local.shared(two, expected, near, len(z), sensor, stand, r)
+    _, (unclaimed, _) = local.shared(two, expected, near, len(z), sensor, stand, r)
     np.testing.assert_allclose(unclaimed, (1.0 + none) / (1.0 + none + 2.0 * hit), rtol=1e-9)

@@ -52,13 +52,22 @@ class Joint(NamedTuple):
     Attributes:
         log_nu: log of nu (Eq. 21) for every hypothesis with a plot, shape (T, C, M); 0 where it is impossible anyway.
         unclaimed: probability that a plot of the scan is that of none of the tracks, shape (plots,).
+        false: that it is that of no track which is a target, shape (plots,).
     """
 
     log_nu: Array
     unclaimed: Array
+    false: Array
 
 
-def joint(log_w: Array, log_p_star: Array, number: IntArray | None, plots: int, existence: Array) -> Joint:
+def joint(
+    log_w: Array,
+    log_p_star: Array,
+    number: IntArray | None,
+    plots: int,
+    existence: Array,
+    target: Array | None = None,
+) -> Joint:
     """Associate tracks that share the plots of a scan (Eq. 21).
 
     Args:
@@ -68,6 +77,7 @@ def joint(log_w: Array, log_p_star: Array, number: IntArray | None, plots: int, 
         number: which plot of the scan each is, see ``Plots``, shape (T, C, M); None: they are in order.
         plots: how many the scan has.
         existence: probability of each track to exist, before the scan, shape (T,).
+        target: probability of each track to be that of a target, if it exists, shape (T,); None: all are.
 
     Returns:
         what to add to log p*_j, j > 0, and what is left over.
@@ -90,7 +100,8 @@ def joint(log_w: Array, log_p_star: Array, number: IntArray | None, plots: int, 
     log_nu = log_free(claims)
     shared = np.zeros(hits.shape)
     shared[at] = log_nu[mine]
-    return Joint(shared, unclaimed(claims, log_nu, plots))
+    left = unclaimed(claims, log_nu, plots)
+    return Joint(shared, left, left if target is None else unclaimed(claims, log_nu, plots, target))
 
 
 def log_free(claims: Claims) -> Array:
@@ -132,12 +143,13 @@ def _solved(track: IntArray, plot: IntArray, log_odds: Array) -> Array:
     return found
 
 
-def unclaimed(claims: Claims, log_nu: Array, plots: int) -> Array:
-    """Probability of each plot of the scan to be that of none of the tracks (Eq. 21), shape (plots,)."""
+def unclaimed(claims: Claims, log_nu: Array, plots: int, target: Array | None = None) -> Array:
+    """Probability of each plot of the scan to be that of none of the tracks, or targets (Eq. 21), shape (plots,)."""
     log_claim = claims.log_hit + log_nu
     log_total = claims.log_none.copy()
     np.logaddexp.at(log_total, claims.track, log_claim)
-    claimed = np.bincount(claims.plot, np.exp(log_claim - log_total[claims.track]), plots)
+    claim = np.exp(log_claim - log_total[claims.track])
+    claimed = np.bincount(claims.plot, claim if target is None else claim * target[claims.track], plots)
     left: Array = np.maximum(1.0 - claimed, 0.0)
     return left
 

@@ -107,7 +107,7 @@ def existences(rng: np.random.Generator, tracks: int) -> Array:
 
 def of_one_component(log_p: Array, r: Array) -> tuple[Array, Array]:
     """Log nu and what is unclaimed, of tracks with one component."""
-    log_nu, left = joint(np.zeros((len(log_p), 1)), log_p[:, None], None, log_p.shape[1] - 1, r)
+    log_nu, left, _ = joint(np.zeros((len(log_p), 1)), log_p[:, None], None, log_p.shape[1] - 1, r)
     return log_nu[:, 0], left
 
 

@@ -64,16 +64,24 @@ class Origin(Model):
 
 
 class DecisionConfig(Model):
-    """Wald's test: p0 accept h1 under h0, p1 accept h1 under h1; not enabled, LR is computed and nothing decided."""
+    """Wald's test.
+
+    Attributes:
+        p0: probability of accepting h1 (a target) under h0 (none).
+        p1: probability of accepting h1 under h1.
+        keep: the same for the tests of a confirmed track, one after every confirmation; default: p1.
+        enabled: if not, LR is computed and nothing decided.
+    """
 
     p0: InnerProbability = 1e-4
     p1: InnerProbability = 0.95
+    keep: InnerProbability | None = None
     enabled: bool = True
 
     @property
     def thresholds(self) -> Thresholds:
         """Log A and log B."""
-        return thresholds(self.p0, self.p1)
+        return thresholds(self.p0, self.p1, self.keep)
 
 
 class StudyConfig(Model):

@@ -37,7 +37,7 @@ from common.messages import (
 from common.quantities import NS_PER_S
 from fusion_center.factors import Fuser
 from fusion_center.initiation import Initiation, Unclaimed
-from fusion_center.picture import Picture
+from fusion_center.picture import Picture, shown
 from fusion_center.selected import SelectedFuser
 from fusion_center.state import (
     AnyExpected,
@@ -90,20 +90,11 @@ class Center:
     def of(cls, scenario: Scenario, *, speed: float = 0.0, wait_s: float = 10.0, first_epoch: int = 1) -> Center:
         """The center of a scenario."""
         fuser: AnyFuser = SelectedFuser.of(scenario) if scenario.fusion.mode == "selected" else Fuser.of(scenario)
-        picture = fuser.empty()
-        if scenario.hypotheses:
-            priors = [hypothesis.density for hypothesis in scenario.hypotheses]
-            picture = fuser.begin(
-                picture,
-                np.arange(len(priors)),
-                np.array([scenario.to_ns(hypothesis.start) for hypothesis in scenario.hypotheses]),
-                Gaussian(np.array([prior.x for prior in priors]), np.array([prior.P for prior in priors])),
-            )
         return cls(
             names=scenario.sensor_names,
             fusion=scenario.fusion,
             fuser=fuser,
-            hypotheses=picture,
+            hypotheses=given(scenario, fuser),
             initiation=Initiation.of(scenario),
             epoch_ns=scenario.epoch_ns,
             speed=speed,
@@ -442,20 +433,20 @@ class Center:
 
     def tracks(self, state: State) -> Tracks:
         """The newest picture as a message: all tracks that have started."""
-        picture = state.picture
-        picture = take(picture, picture.starts_ns <= state.time_ns)
-        return Tracks(
-            time_ns=state.time_ns,
-            sensors=self.names,
-            ids=picture.ids,
-            status=picture.status,
-            scans=picture.scans,
-            contributing=picture.contributing,
-            log_lr=picture.log_lr,
-            log_lr_total=picture.log_lr_total,
-            x=picture.fused_x,
-            P=picture.fused_P,
-        )
+        return shown(state.picture, state.time_ns, self.names)
+
+
+def given(scenario: Scenario, fuser: AnyFuser) -> Picture:
+    """The tracks that a scenario gives."""
+    if not scenario.hypotheses:
+        return fuser.empty()
+    priors = [hypothesis.density for hypothesis in scenario.hypotheses]
+    return fuser.begin(
+        fuser.empty(),
+        np.arange(len(priors)),
+        np.array([scenario.to_ns(hypothesis.start) for hypothesis in scenario.hypotheses]),
+        Gaussian(np.array([prior.x for prior in priors]), np.array([prior.P for prior in priors])),
+    )
 
 
 def _fused(picture: Picture, time_ns: int) -> tuple[IntArray, Array, Array]:
@@ -466,8 +457,7 @@ def _fused(picture: Picture, time_ns: int) -> tuple[IntArray, Array, Array]:
 
 def _unclaimed(reports: Mapping[int, AnyHeard]) -> list[Unclaimed]:
     """The plots of one measurement time that no track claims, by sensor."""
-    said = ((number, reports[number].report) for number in sorted(reports))
-    return [Unclaimed(said.time_ns, number, said.position, said.ids, said.unclaimed) for number, said in said]
+    return [Unclaimed.of(number, reports[number].report) for number in sorted(reports)]
 
 
 def _corrections(before: list[Decision], after: list[Decision]) -> list[Message]:

@@ -42,6 +42,11 @@ class Unclaimed(NamedTuple):
     ids: IntArray
     z: Array
 
+    @classmethod
+    def of(cls, number: int, report: Report | Picked) -> Unclaimed:
+        """Those that a sensor reports."""
+        return cls(report.time_ns, number, report.position, report.ids, report.unclaimed)
+
 
 class Duplicate(NamedTuple):
     """A track that is another one."""
@@ -152,7 +157,7 @@ class Initiation:
         oldest_ns = scan.time_ns - round(self.config.within * NS_PER_S)
         best, x, P = np.full(count, np.inf), np.zeros((count, n)), np.zeros((count, n, n))
         for earlier in before:
-            if not oldest_ns <= earlier.time_ns < scan.time_ns:
+            if not (len(earlier.z) and oldest_ns <= earlier.time_ns < scan.time_ns):
                 continue
             first, second = np.divmod(np.arange(len(earlier.z) * count), count)
             start = self._from_plots(earlier)
@@ -161,7 +166,7 @@ class Initiation:
             density, distance = with_second(chosen, dt, scan.z[second], measurement, scan.position, self.motion)
             fits = (distance <= gate) & self._slow(density)
             distance = np.where(fits, distance, np.inf).reshape(-1, count)
-            closest = distance.argmin(axis=0) * count + np.arange(count) if len(first) else np.empty(0, np.intp)
+            closest = distance.argmin(axis=0) * count + np.arange(count)
             for plot, pair in enumerate(closest.tolist()):
                 if distance.flat[pair] < best[plot]:
                     best[plot], x[plot], P[plot] = distance.flat[pair], density.x[pair], density.P[pair]

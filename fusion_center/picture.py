@@ -6,9 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from common.estimation.batch import take
 from common.estimation.gaussian import Array, BoolArray
 from common.estimation.sprt import StatusArray, Thresholds, decide
-from common.messages import Decision, IntArray
+from common.messages import Decision, IntArray, Tracks
 
 
 class Picture(NamedTuple):
@@ -89,6 +90,29 @@ def decided(picture: Picture, limits: Thresholds | None) -> tuple[Picture, list[
         for row in np.nonzero(verdict.status != picture.status)[0]
     ]
     return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
+
+
+def shown(picture: Picture, time_ns: int, names: tuple[str, ...]) -> Tracks:
+    """A picture as a message: all tracks that have started.
+
+    Args:
+        picture: of a measurement time.
+        time_ns: that time.
+        names: of the sensors.
+    """
+    picture = take(picture, picture.starts_ns <= time_ns)
+    return Tracks(
+        time_ns=time_ns,
+        sensors=names,
+        ids=picture.ids,
+        status=picture.status,
+        scans=picture.scans,
+        contributing=picture.contributing,
+        log_lr=picture.log_lr,
+        log_lr_total=picture.log_lr_total,
+        x=picture.fused_x,
+        P=picture.fused_P,
+    )
 
 
 def common(ours: IntArray, theirs: IntArray) -> tuple[IntArray | slice, IntArray | slice]:

@@ -73,7 +73,7 @@ def run(
         seed=seed_of(loaded, seed),
         speed=speed,
         out=out or Path("runs") / f"{loaded.name}-{stamp}",
-        end_ns=scans[-1].time_ns if scans else loaded.epoch_ns,
+        scans=scans,
     )
     execute(order, Console(stderr=False, highlight=False))
 
@@ -85,6 +85,7 @@ def replay(
     *,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
     lag: Seconds | None = None,
+    centralised: Annotated[bool, Parameter(negative=())] = False,
 ) -> None:
     """Work through recorded plots in one process, deterministically and without a network.
 
@@ -93,8 +94,10 @@ def replay(
         plots: recorded plots (JSON Lines); default: the scenario's recording, or its simulated world.
         as_json: print one JSON line per track and measurement time, and nothing else.
         lag: with --json, say in each line also where the track was so many seconds ago, with everything known now.
+        centralised: let one tracker have all plots, instead of a network: the yardstick for what a network finds.
     """
     from sensor_node.sources import all_scans
+    from studies.centralised import Centralised
     from studies.lines import TrackLines
     from studies.replay import Replay
 
@@ -103,7 +106,8 @@ def replay(
     loaded = load_scenario(find(scenario))
     lines = TrackLines(loaded, lag)
     final: dict[int, str] = {}
-    for message in Replay(loaded, all_scans(loaded, plots=plots)).run():
+    scans = all_scans(loaded, plots=plots)
+    for message in Centralised.of(loaded).run(scans) if centralised else Replay(loaded, scans).run():
         if isinstance(message, Tracks) and as_json:
             sys.stdout.writelines(line + "\n" for line in lines.of(message))
         elif isinstance(message, Tracks):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +14,12 @@ from common.config import Network, Scenario
 from common.errors import DecodeError
 from common.estimation.sprt import Status
 from common.inbox import Exited, Heard, Inbox, Incoming, Missed, Present, Said, Stopped
-from common.messages import NEVER, Clock, Decision, Keys, Tracks, sensor_of
+from common.messages import NEVER, Clock, Decision, Keys, Scan, Tracks, sensor_of
 from common.process import stopped_by_signals
 from common.transport import Bus, open_zenoh
 from launch.processes import Children, LaunchError, describe_exit
 from launch.status import LiveStatus
+from studies.inputs import Input, keep, looked_at
 from studies.record import Record, write_report
 
 CENTER = "center"
@@ -36,7 +38,7 @@ class Order:
         seed: of the simulated world.
         speed: seconds of measurement time per second, 0: lockstep.
         out: folder of the report.
-        end_ns: time of the last scan.
+        scans: of all sources, by time.
     """
 
     scenario: Scenario
@@ -45,7 +47,12 @@ class Order:
     seed: int
     speed: float
     out: Path
-    end_ns: int
+    scans: Sequence[Scan]
+
+    @property
+    def end_ns(self) -> int:
+        """Time of the last scan."""
+        return self.scans[-1].time_ns if self.scans else self.scenario.epoch_ns
 
 
 class Run:
@@ -196,11 +203,13 @@ def execute(order: Order, console: Console) -> None:
         LaunchError: the run failed; what was heard until then is in the report.
     """
     order.out.mkdir(parents=True, exist_ok=True)
+    text = order.path.read_bytes()
     run = Run(order, console)
     try:
         run.run()
     finally:
-        files = write_report(run.record, order.out, {"seed": order.seed, "speed": order.speed or "max"})
+        files = [*write_report(run.record, order.out, {"seed": order.seed, "speed": order.speed or "max"})]
+        files.append(keep(order.out, text, Input(order.scenario, looked_at(run.record, order.scans))))
         last = [Status(int(history.status[-1])) for history in run.record.histories().values()]
         outcome = ", ".join(f"{last.count(status)} {status.name.lower()}" for status in Status)
         if run.record.plots_shed:

@@ -48,7 +48,7 @@ class Ready(NamedTuple):
 
     Attributes:
         tracks, advice: of the state that it was worked out from; it is of use as long as these are the same.
-        time_ns, position: of the scan.
+        time_ns, position, number: of the scan.
         advised: all tracks, advice followed.
         live: which of them started before the scan.
         predicted: those, at the time of the scan.
@@ -60,16 +60,18 @@ class Ready(NamedTuple):
     advice: tuple[Advice, ...]
     time_ns: int
     position: Array
+    number: int
     advised: Tracks
     live: BoolArray
     predicted: Tracks
     mixture: Mixture
     expected: Expected
 
-    def fits(self, state: State, time_ns: int, position: Array) -> bool:
-        """Whether it was worked out from the tracks and advice of a state, for the scan of that time and position."""
+    def fits(self, state: State, time_ns: int, position: Array, number: int) -> bool:
+        """Whether it was worked out from the tracks and advice of a state, for the scan of that time and sensor."""
         same_state = self.tracks is state.tracks and self.advice is state.advice
-        return same_state and self.time_ns == time_ns and np.array_equal(self.position, position)
+        same_scan = self.time_ns == time_ns and self.number == number
+        return same_state and same_scan and np.array_equal(self.position, position)
 
 
 class Look(NamedTuple):
@@ -79,12 +81,14 @@ class Look(NamedTuple):
         time_ns: of the scan.
         position: where the sensor stood [m], shape (d,).
         plots: that all tracks share; in a study, where all tracks start together, of every track its own.
+        number: of the sensor in the scenario.
         log_free: log probability of each plot to belong to none of the tracks there were; None: not told.
     """
 
     time_ns: int
     position: Array
     plots: Plots
+    number: int
     log_free: Array | None = None
 
 

@@ -28,19 +28,20 @@ from sensor_node.state import Look, Ready, Schedule, State, Tracks, alike, left,
 
 @dataclass(frozen=True)
 class LocalTracker:
-    """The steps of one sensor's tracker.
+    """The steps of one sensor's tracker; it works in the scans of other sensors as well, where it is given them.
 
     Attributes:
         config: the sensor as the scenario describes it.
-        sensor: the sensor model.
-        sensors: models of all sensors of the network.
+        configs: all sensors of the network, as the scenario describes them.
+        sensors: models of them.
         number: of this sensor among them.
         filter: predicts and filters the tracks.
         feedback: the center answers every measurement time: with the fused tracks, as advice or to begin anew
             (theory.md §3, 6), or with those that begin (§8).
         advised: that answer is advice or to begin anew.
         joint: tracks that share plots are associated jointly (Eq. 21).
-        claimed: a plot that belongs to the tracks with at least this probability starts none; None: none does.
+        claimed: a plot that belongs to the tracks with at least this probability starts none; None: none does. Nor
+            does a bearing.
         rounded: reports are in single precision.
         selection: which plots are sent, where the center tracks; else None.
         digest: of what the center must have in common with this node.
@@ -49,7 +50,7 @@ class LocalTracker:
     """
 
     config: SensorConfig
-    sensor: Sensor
+    configs: tuple[SensorConfig, ...]
     sensors: tuple[Sensor, ...]
     number: int
     filter: LocalFilter
@@ -74,19 +75,17 @@ class LocalTracker:
         if scenario.fusion.mode == "dkf" and schedule is None:
             raise ValueError("mode 'dkf' needs the scan times of all sensors beforehand")
         motion = scenario.motion.build()
-        config = scenario.sensor(name)
-        sensors = tuple(sensor.build(motion) for sensor in scenario.sensors)
-        number = scenario.sensor_names.index(name)
+        number = scenario.sensors.index(scenario.sensor(name))
         return cls(
-            config=config,
-            sensor=sensors[number],
-            sensors=sensors,
+            config=scenario.sensors[number],
+            configs=scenario.sensors,
+            sensors=tuple(sensor.build(motion) for sensor in scenario.sensors),
             number=number,
             filter=LocalFilter.of(scenario),
             feedback=scenario.fusion.feedback != "none" or scenario.initiation is not None,
             advised=scenario.fusion.feedback != "none",
             joint=scenario.joint,
-            claimed=None if scenario.initiation is None or config.kind == "bearing" else scenario.initiation.claimed,
+            claimed=None if scenario.initiation is None else scenario.initiation.claimed,
             rounded=scenario.fusion.precision == "float32",
             selection=scenario.fusion.selection.build() if scenario.fusion.mode == "selected" else None,
             digest=scenario.digest,
@@ -104,16 +103,17 @@ class LocalTracker:
     def prepare(self, state: State, time_ns: int, position: Array) -> State:
         """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
         state = self._rebased(state, time_ns)
-        return state._replace(ready=self._ready(state, time_ns, position))
+        return state._replace(ready=self._ready(state, time_ns, position, self.number))
 
     def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report | Picked]:
         """Filter one scan and report every track that started before it."""
-        return self.look(state, Look(scan.time_ns, scan.position, Plots(scan.z)), next_ns)
+        number = next(number for number, config in enumerate(self.configs) if config.name == scan.sensor)
+        return self.look(state, Look(scan.time_ns, scan.position, Plots(scan.z), number), next_ns)
 
     def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""
         state = self._rebased(state, look.time_ns)
-        ready = self._ready(state, look.time_ns, look.position)
+        ready = self._ready(state, look.time_ns, look.position, look.number)
         mixture, free = self._filtered(self.filter, ready.mixture, ready.expected, look, ready.predicted.log_odds)
         filtered = self._with(ready.predicted, mixture)
         look, unclaimed = self._unclaimed(look, free)
@@ -131,13 +131,17 @@ class LocalTracker:
 
     def _unclaimed(self, look: Look, free: Array | None) -> tuple[Look, Array]:
         """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""
-        z = look.plots.z
-        if self.claimed is None or z.ndim > 2:
+        z, claimed = look.plots.z, self._claimed(look.number)
+        if claimed is None or z.ndim > 2:
             return look, np.empty((0, z.shape[-1]))
         if free is None:
             return look, z
         with np.errstate(divide="ignore"):  # surely claimed
-            return look._replace(log_free=np.log(free)), z[free > 1.0 - self.claimed]
+            return look._replace(log_free=np.log(free)), z[free > 1.0 - claimed]
+
+    def _claimed(self, number: int) -> float | None:
+        """``claimed``, of the plots of a sensor."""
+        return None if self.configs[number].kind == "bearing" else self.claimed
 
     def _picked(
         self, state: State, look: Look, next_ns: int, ready: Ready, selection: Selection, unclaimed: Array
@@ -154,7 +158,7 @@ class LocalTracker:
         if self.rounded:
             z = z.astype(np.float32).astype(np.float64)
         return Picked(
-            sensor=self.config.name,
+            sensor=self.configs[look.number].name,
             sequence=state.sequence,
             time_ns=look.time_ns,
             next_ns=next_ns,
@@ -176,7 +180,7 @@ class LocalTracker:
         if self.rounded:
             x, P = x.astype(np.float32).astype(np.float64), P.astype(np.float32).astype(np.float64)
         return Report(
-            sensor=self.config.name,
+            sensor=self.configs[look.number].name,
             sequence=state.sequence,
             time_ns=look.time_ns,
             next_ns=next_ns,
@@ -186,7 +190,7 @@ class LocalTracker:
             log_g=mixture.log_g[there],
             x=x,
             P=P,
-            position=look.position if self.claimed is not None else np.empty(0),
+            position=look.position if self._claimed(look.number) is not None else np.empty(0),
             unclaimed=unclaimed,
         )
 
@@ -251,7 +255,7 @@ class LocalTracker:
         for look in state.recent if alone else map(left, state.recent):
             due = fresh.times_ns < look.time_ns
             if due.any():
-                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position)
+                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position, look.number)
                 mixture, _ = self._filtered(self.filter, mixture, expected, look, predicted.log_odds)
                 fresh = put_tracks(fresh, due, self._with(predicted, mixture))
         tracks = concatenate(*alike(state.tracks, fresh))
@@ -266,15 +270,17 @@ class LocalTracker:
         """Keep advice for the next scan after its time (theory.md §6)."""
         return state._replace(advice=(*state.advice, advice))
 
-    def _ready(self, state: State, time_ns: int, position: Array) -> Ready:
+    def _ready(self, state: State, time_ns: int, position: Array, number: int) -> Ready:
         """What the scan of a time needs: as it was prepared, where that still holds."""
         ready = state.ready
-        if ready is not None and ready.fits(state, time_ns, position):
+        if ready is not None and ready.fits(state, time_ns, position, number):
             return ready
         advised = self._follow_advice(state, time_ns)
-        live = advised.times_ns < time_ns
-        moving = self._expect(take(advised, live), time_ns, position)
-        return Ready(state.tracks, state.advice, time_ns, position, advised, live, *moving)
+        # Another sensor may have scanned at this very time.
+        again = bool(state.recent) and state.recent[-1].time_ns == time_ns
+        live = advised.times_ns < time_ns + again
+        moving = self._expect(take(advised, live), time_ns, position, number)
+        return Ready(state.tracks, state.advice, time_ns, position, number, advised, live, *moving)
 
     def _follow_advice(self, state: State, t_ns: int) -> Tracks:
         """Set the association filters to the newest fused tracks from before ``t_ns`` and redo the scans since.
@@ -297,7 +303,7 @@ class LocalTracker:
             if due.any():
                 prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
                 predicted = honest.predict(prior, _interval(times[due], look.time_ns))
-                expected = self._seen(honest, predicted, look.position)
+                expected = self._seen(honest, predicted, look.position, look.number)
                 filtered, _ = self._filtered(honest, predicted, expected, look, tracks.log_odds[due])
                 log_w[due], _, ((x_a[due],), (P_a[due],)) = filtered
                 times[due] = look.time_ns
@@ -314,27 +320,29 @@ class LocalTracker:
             start.ids, start.times_ns, log_w, log_g, x[0], P[0], start.times_ns, x[1], P[1], log_odds, network_P
         )
 
-    def _expect(self, tracks: Tracks, time_ns: int, position: Array) -> tuple[Tracks, Mixture, Expected]:
-        """Predict to a time, and what the sensor will see from a position then."""
+    def _expect(self, tracks: Tracks, time_ns: int, position: Array, number: int) -> tuple[Tracks, Mixture, Expected]:
+        """Predict to a time, and what a sensor will see from a position then."""
         mixture, network_P = self._predict(tracks, time_ns)
         now = np.full_like(tracks.times_ns, time_ns)
         predicted = self._with(tracks._replace(times_ns=now, times_a_ns=now, network_P=network_P), mixture)
-        return predicted, mixture, self._seen(self.filter, mixture, position)
+        return predicted, mixture, self._seen(self.filter, mixture, position, number)
 
-    def _seen(self, local: LocalFilter, predicted: Mixture, position: Array) -> Expected:
-        return local.expect(predicted.density, self.sensor, position, self.config.view_center(position))
+    def _seen(self, local: LocalFilter, predicted: Mixture, position: Array, number: int) -> Expected:
+        center = self.configs[number].view_center(position)
+        return local.expect(predicted.density, self.sensors[number], position, center)
 
     def _filtered(
         self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
     ) -> tuple[Mixture, Array | None]:
         """Tracks after a scan, and the probability of each plot to be that of none; None: not asked for."""
-        near, free = local.near(expected, look.plots, self.sensor, look.position), None
-        wanted = self.claimed is not None or (self.joint and len(log_odds) > 1)
+        sensor = self.sensors[look.number]
+        near, free = local.near(expected, look.plots, sensor, look.position), None
+        wanted = self._claimed(look.number) is not None or (self.joint and len(log_odds) > 1)
         if wanted and look.plots.z.ndim == 2:
             plots, existence = len(look.plots.z), expit(log_odds)
-            shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
+            shared, free = local.shared(predicted, expected, near, plots, sensor, look.position, existence)
             near = shared if self.joint else near
-        return local.update(predicted, expected, near, self.sensor, look.position), free
+        return local.update(predicted, expected, near, sensor, look.position), free
 
     def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
         mixture = self._mixture(tracks)

@@ -58,7 +58,7 @@ def run(words: list[str], folder: Path) -> str:
 @pytest.mark.processes
 def test_first_steps_of_the_readme(folder: Path) -> None:
     steps = list(commands(section(README, "First steps")))
-    assert len(steps) == 5
+    assert len(steps) == 6
     for words in steps:
         run(words, folder)
     assert len((folder / "plots.jsonl").read_text().splitlines()) == 120
@@ -170,6 +170,14 @@ def test_how_to_evaluate_a_recording(tmp_path: Path) -> None:
     shown = [line.rstrip() for line in blocks(EVALUATE, "text")[0].splitlines()]
     assert [line.rstrip() for line in said.splitlines()][: len(shown)] == shown
     assert read_truth(tmp_path / "shown.jsonl")[1].times_s.tolist() == [0.16]
+
+
+def test_how_to_evaluate_beside_the_centralised_run(tmp_path: Path) -> None:
+    (tmp_path / "scenarios").symlink_to(ROOT / "scenarios")
+    alone, (*replay, _, lines), evaluate = commands(section(EVALUATE, "The centralised"))
+    assert "track 0: confirmed" in run(alone, tmp_path)
+    (tmp_path / lines).write_text(run(replay, tmp_path))
+    assert "lines (centralised)" in run(evaluate, tmp_path)
 
 
 @pytest.mark.processes

@@ -18,9 +18,12 @@ from common.process import main
 from launch.cli import app
 from scenarios.catalogue import find
 from scenarios.truth import read_truth, write_truth
-from scenarios.world import truth
+from scenarios.world import simulate_all, truth
 from studies.evaluate.runs import names, read_run
-from studies.record import Record
+from studies.evaluate.yardstick import centralised
+from studies.inputs import Input, keep, kept, looked_at
+from studies.record import Record, write_report
+from studies.replay import Replay
 
 LINE: dict[str, Any] = {"time": 2.0, "track": 5, "status": "confirmed", "x": [1.0, 2.0, 3.0, 4.0], "P": []}
 POINT: dict[str, Any] = {"target": 1, "time": 2.0, "position": [1.0, 2.0]}
@@ -189,6 +192,143 @@ def test_a_run_without_a_track_and_a_world_without_a_target(tmp_path: Path, caps
     assert "targets confirmed 0 of 1 after [s], mean - held share 0.0%" in said(capsys)
     command("evaluate", lines, "--truth", nothing)
     assert "targets confirmed 0 of 0 after [s], mean - held share -" in said(capsys)
+
+
+def recorded(folder: Path, plot: str, seed: int = 1) -> Path:
+    """A run folder as ``waldnet run`` writes it, and the truth in it."""
+    loaded = load_scenario(find(plot))
+    scans, record = simulate_all(loaded, seed), Record(loaded)
+    folder.mkdir()
+    for message in Replay(loaded, scans).run():
+        record.note(message)
+    write_report(record, folder, {"seed": seed})
+    keep(folder, find(plot).read_bytes(), Input(loaded, looked_at(record, scans)))
+    with (folder / "truth.jsonl").open("w") as file:
+        write_truth(file, *truth(loaded, seed), loaded)
+    return folder
+
+
+def test_a_run_stands_beside_the_centralised_run_of_its_plots(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = recorded(tmp_path / "run", "mixed-sensors", seed=7)
+    words = ("evaluate", run, "--truth", run / "truth.jsonl")
+    command(*words)
+    shown = capsys.readouterr().out
+    assert shown.splitlines()[1].split() == ["run", "run", "(centralised)"]
+    assert "targets of run (centralised)" in shown
+    command(*words, "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert told == json.loads((run / "evaluation.json").read_text())
+    network, one = told["runs"]
+    assert [(each["run"], each["centralised_of"]) for each in (network, one)] == [
+        ("run", []),
+        ("run (centralised)", ["run"]),
+    ]
+    assert told["without_centralised"] == []
+    assert 0.0 < one["rmse_m"] < network["rmse_m"]
+    # The same as of the lines that a centralised replay prints.
+    command("replay", run / "input/scenario.toml", run / "input/plots.jsonl", "--centralised", "--json")
+    lines = write(tmp_path / "lines.jsonl", capsys.readouterr().out)
+    command("evaluate", run, lines, "--truth", run / "truth.jsonl", "--json", "--no-centralised")
+    again = json.loads(capsys.readouterr().out)["runs"]
+    assert [each["run"] for each in again] == ["run", "lines"]
+    assert again[0] == network
+    assert again[1] == {**one, "run": "lines", "centralised_of": []}
+
+
+def test_lines_stand_beside_the_centralised_run_of_a_scenario(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = recorded(tmp_path / "run", "four-radars", seed=5)
+    for name in ("one", "two"):
+        write(tmp_path / f"{name}.jsonl", (run / "tracks.jsonl").read_text())
+    words = ["evaluate", tmp_path / "one.jsonl", run, tmp_path / "two.jsonl", "--truth", run / "truth.jsonl"]
+    command(*words)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "two: no centralised run beside it, for it keeps no plots; --scenario says where they come from" in said
+    command(*words, "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert told["without_centralised"] == ["one", "two"]
+    assert [each["run"] for each in told["runs"]] == ["one", "run", "run (centralised)", "two"]
+    command(*words, "--json", "--scenario", "four-radars", "--plots", run / "input/plots.jsonl")
+    told = json.loads(capsys.readouterr().out)
+    assert told["without_centralised"] == []
+    *_, own, two, common = told["runs"]
+    assert (two["run"], common["run"]) == ("two", "one, two (centralised)")
+    assert common == {**own, "run": "one, two (centralised)", "centralised_of": ["one", "two"]}
+    # Without plots, as in replay: the scenario's own, here another world.
+    command(*words[:2], *words[4:], "--json", "--scenario", "four-radars")
+    *_, other = json.loads(capsys.readouterr().out)["runs"]
+    assert other["run"] == "one (centralised)"
+    assert other["rmse_m"] != own["rmse_m"]
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        (("--scenario", "nowhere"), "nowhere: no such file, and none of the scenarios that come along: "),
+        (("--plots", "p.jsonl"), "--plots: says nothing without the scenario they are of: give --scenario too\n"),
+        (
+            ("--scenario", "four-radars", "--plots", "none.jsonl"),
+            "none.jsonl: cannot be read: No such file or directory",
+        ),
+        (
+            ("--scenario", "four-radars", "--no-centralised"),
+            "--scenario: only the centralised run needs it, which --no-centralised leaves out\n",
+        ),
+        (("--scenario", "PLANE"), "scenario plane: has 2 dimensions, the truth has 3\n"),
+    ],
+)
+def test_what_is_wrong_with_the_plots_of_lines_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: tuple[str, ...], reason: str
+) -> None:
+    high = {"position": [0.0, 0.0, 0.0]} if "PLANE" in options else {}
+    text = find("four-radars").read_text().replace('name = "four-radars"', 'name = "plane"')
+    plane = write(tmp_path / "plane.toml", text)
+    run = write(tmp_path / "lines.jsonl", *straight(**({"x": [0.0] * 6} if high else {})))
+    known = write(tmp_path / "truth.jsonl", *points(**high))
+    words = [str(plane) if option == "PLANE" else option for option in options]
+    with pytest.raises(SystemExit) as caught:
+        main(app, ["evaluate", str(run), "--truth", str(known), *words])
+    assert caught.value.code == 1
+    assert capsys.readouterr().err.startswith(reason)
+
+
+def test_a_scenario_for_runs_that_keep_theirs_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = recorded(tmp_path / "run", "four-radars")
+    words = ("evaluate", run, "--truth", run / "truth.jsonl", "--scenario", "four-radars")
+    with pytest.raises(SystemExit):
+        main(app, [*map(str, words)])
+    assert capsys.readouterr().err == "--scenario: every run here keeps its own scenario and plots; leave it out\n"
+
+
+def test_plots_that_nobody_worked_in_are_not_kept(tmp_path: Path) -> None:
+    """A run that was stopped, and of which a sensor had died before."""
+    loaded = load_scenario(find("four-radars"))
+    scans, record = simulate_all(loaded, 1), Record(loaded)
+    first, *_, last = loaded.sensor_names
+    stop_ns = scans[-1].time_ns // 2 + scans[0].time_ns // 2
+    for scan in scans:
+        if scan.time_ns <= stop_ns - (10**10 if scan.sensor == last else 0):
+            record.note(scan)
+    for message in Replay(loaded, [scan for scan in scans if scan.time_ns <= stop_ns]).run():
+        record.note(message)
+    record.lost[last] = "killed"
+    record.scans.remove(record.scans[0])  # shed by a link
+    keep(tmp_path, find("four-radars").read_bytes(), Input(loaded, looked_at(record, scans)))
+    found = kept(tmp_path)
+    assert found is not None
+    shown = {name: [scan.time_ns for scan in found.scans if scan.sensor == name] for name in (first, last)}
+    assert max(shown[first]) == max(time_ns for time_ns in record.pictures) <= stop_ns
+    assert stop_ns - 12 * 10**9 < max(shown[last]) <= stop_ns - 10**10
+    assert len(shown[first]) == len([scan for scan in scans if scan.sensor == first and scan.time_ns <= stop_ns])
+    # Of a run in which nothing was worked in nothing is kept; and it can be judged.
+    keep(tmp_path, find("four-radars").read_bytes(), Input(loaded, looked_at(Record(loaded), scans)))
+    nothing = kept(tmp_path)
+    assert nothing is not None
+    assert nothing.scans == []
+    assert centralised(nothing, ("none",), 2).span_s is None
 
 
 @pytest.mark.parametrize(

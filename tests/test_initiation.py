@@ -167,6 +167,15 @@ def test_a_network_finds_its_targets_itself(tables: dict[str, Any]) -> None:
     assert len(confirmed) == 2
 
 
+def test_a_network_with_a_bearing_sensor_finds_its_targets_from_two_plots() -> None:
+    plot = two_boats(initiation={"speed": 100.0, "plots": 2})
+    disc = {"shape": "disc", "radius": 20_000.0}
+    bearing = sensor_table("c", kind="bearing", sigma=[0.01], field_of_view=disc, false_plots=0.5)
+    plot = plot.model_copy(update={"sensors": (*plot.sensors, scenario(bearing).sensors[0])})
+    last = final(list(Replay(plot, simulate_all(plot, 5)).run()))
+    assert (last.status == 1).sum() == 2
+
+
 def test_live_and_replayed_networks_say_the_same_in_lockstep() -> None:
     plot = two_boats()
     scans = simulate_all(plot, 5)

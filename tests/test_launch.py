@@ -97,7 +97,7 @@ def test_a_report_of_a_decision_whose_picture_was_never_heard(tmp_path: Path) ->
 
 def test_plots_that_were_shed_are_told_once_and_counted(tmp_path: Path) -> None:
     plot, said = scenario(), io.StringIO()
-    run = Run(Order(plot, tmp_path, None, 1, 0.0, tmp_path, 0), Console(file=said, width=200))
+    run = Run(Order(plot, tmp_path, None, 1, 0.0, tmp_path, ()), Console(file=said, width=200))
     for number in (2, 3):
         run._work_off(Missed(Keys(plot.network.name).plots("a"), number))
     assert run.record.summary({})["plots_shed"] == {"a": 5}

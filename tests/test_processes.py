@@ -46,6 +46,7 @@ from common.quantities import NS_PER_S
 from common.transport import open_zenoh
 from fusion_center.state import Presence
 from scenarios.catalogue import find
+from scenarios.plots import read_plots
 from sensor_node.sources import all_scans
 from studies.lines import TrackLines
 from studies.network import run_in_memory
@@ -131,7 +132,7 @@ def test_a_run_ends_well_and_leaves_a_report_and_no_process(lockstep: Ran) -> No
     assert lockstep.left == {}
     assert lockstep.decisions["sensors_lost"] == {}
     assert lockstep.decisions["withdrawn"] == []
-    names = ("decisions.json", "tracks.jsonl", "log_lr.png", "plan.png")
+    names = ("decisions.json", "tracks.jsonl", "log_lr.png", "plan.png", "input")
     assert lockstep.out[-1] == "report: " + ", ".join(str(lockstep.folder / name) for name in names)
     for name in ("log_lr.png", "plan.png"):
         picture = (lockstep.folder / name).read_bytes()
@@ -193,8 +194,11 @@ def test_a_run_in_real_time_says_what_replay_says(processes: Processes, tmp_path
     run = processes.waldnet("run", path.name, "--speed", "30", "--out", "a folder/of mine")
     assert run.wait() == 0, run.err
     assert processes.alive() == {}
-    tracks = points((tmp_path / "a folder" / "of mine" / "tracks.jsonl").read_text().splitlines())
-    assert_agree(tracks, points(processes.output("replay", path.name, "--json")))
+    folder = Path("a folder/of mine")
+    tracks = points((tmp_path / folder / "tracks.jsonl").read_text().splitlines())
+    kept = [str(folder / "input" / name) for name in ("scenario.toml", "plots.jsonl")]
+    for words in ([path.name], kept):
+        assert_agree(tracks, points(processes.output("replay", *words, "--json")))
 
 
 def test_a_sensor_that_dies_does_not_end_the_run(processes: Processes, tmp_path: Path) -> None:
@@ -213,6 +217,9 @@ def test_a_sensor_that_dies_does_not_end_the_run(processes: Processes, tmp_path:
     assert [entry["sensor"] for entry in lost] == ["radar-2"]
     tracks = points((tmp_path / "out" / "tracks.jsonl").read_text().splitlines())
     assert_agree(tracks, replay_until_death(path, "radar-2", tracks))
+    kept = read_plots(tmp_path / "out" / "input" / "plots.jsonl", load_scenario(path))
+    lasts = {scan.sensor: scan.time_ns for scan in kept}
+    assert lasts.pop("radar-2") < min(lasts.values())
 
 
 def replay_until_death(path: Path, sensor: str, got: dict[tuple[float, int], Point]) -> dict[tuple[float, int], Point]:

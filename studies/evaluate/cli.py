@@ -4,9 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
 
 from cyclopts import Parameter, validators
+
+from common.config import load_scenario
+from common.errors import EvaluationError
+
+if TYPE_CHECKING:
+    from studies.inputs import Input
 
 _INFINITE = float("inf")
 
@@ -23,10 +29,15 @@ def evaluate(
     order: _Order = 2.0,
     window: _Positive = 10.0,
     gap: _Positive = 5.0,
+    centralised: bool = True,
+    scenario: str | None = None,
+    plots: Path | None = None,
     figure: Path | None = None,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
 ) -> None:
     """Tell how well a recorded run found its targets: GOSPA, OSPA(2), confirmation, breaks, swaps, false tracks.
+
+    Beside it stands what one tracker makes of the same plots: how well a network could do.
 
     Args:
         run: folder that waldnet run wrote, or file of what waldnet replay --json printed.
@@ -36,6 +47,9 @@ def evaluate(
         order: p of GOSPA and OSPA(2).
         window: of OSPA(2) [s].
         gap: positions of a target that are farther apart in time are not joined [s].
+        centralised: put the centralised run of the same plots beside each run.
+        scenario: of runs that keep no plots, such as files of lines: scenario file, or name of one that comes along.
+        plots: with --scenario: recorded plots (JSON Lines) that these runs had instead of the scenario's.
         figure: PNG file to write, and a JSON file of the same name beside it; default: evaluation.png in the run's
             folder, comparison.png if there are several runs.
         as_json: print one JSON object, and nothing else.
@@ -48,19 +62,23 @@ def evaluate(
     from studies.evaluate.paths import judged_times, targets_at
     from studies.evaluate.runs import read_runs
     from studies.evaluate.table import show
+    from studies.evaluate.yardstick import Beside, with_centralised
 
     rules = Rules(cutoff_m=cutoff, order=order, window_s=window, gap_s=gap)
     known = read_truth(truth)
     d = next((target.positions.shape[1] for target in known.values()), 2)
-    runs = read_runs((run, *others), d)
-    times_s = judged_times(known, runs)
+    paths, of = (run, *others), _input(scenario, plots, centralised=centralised)
+    runs = read_runs(paths, d)
+    beside = with_centralised(runs, paths, of, d) if centralised else Beside(runs, [])
+    times_s = judged_times(known, beside.runs)
     targets = targets_at(known, times_s, gap, d)
-    evaluations = [judge(one, targets, times_s, rules) for one in runs]
+    evaluations = [judge(one, targets, times_s, rules) for one in beside.runs]
     entry: dict[str, Any] = {
         "truth": str(truth),
         **rules._asdict(),
         "first_time": float(times_s[0]),
         "last_time": float(times_s[-1]),
+        "without_centralised": beside.without,
         "runs": [evaluation.entry() for evaluation in evaluations],
     }
     text = json.dumps(entry, allow_nan=False)
@@ -72,7 +90,27 @@ def evaluate(
         console.out(text)
     else:
         show(console, evaluations, rules)
+        for name in beside.without:
+            why = "it keeps no plots; --scenario says where they come from"
+            console.print(f"\n{name}: no centralised run beside it, for {why}", soft_wrap=True)
         console.print(f"\n{picture}, {picture.with_suffix('.json')}", soft_wrap=True)
+
+
+def _input(scenario: str | None, plots: Path | None, *, centralised: bool) -> Input | None:
+    """What the runs had to go on that do not keep it; None: not said."""
+    from scenarios.catalogue import find
+    from sensor_node.sources import all_scans
+    from studies.inputs import Input
+
+    given = [option for option, value in (("--scenario", scenario), ("--plots", plots)) if value is not None]
+    if given and not centralised:
+        raise EvaluationError(f"{given[0]}: only the centralised run needs it, which --no-centralised leaves out")
+    if scenario is None:
+        if given:
+            raise EvaluationError("--plots: says nothing without the scenario they are of: give --scenario too")
+        return None
+    loaded = load_scenario(find(scenario))
+    return Input(loaded, all_scans(loaded, plots=plots))
 
 
 def _default(run: Path, *, several: bool) -> Path:

@@ -35,6 +35,7 @@ class Evaluation(NamedTuple):
 
     Attributes:
         run: its name.
+        centralised_of: of a centralised run, names of the runs whose plots it had; else none.
         times_s: at which was judged, shape (K,).
         targets: that truly were there.
         tracks: confirmed tracks.
@@ -46,6 +47,7 @@ class Evaluation(NamedTuple):
     """
 
     run: str
+    centralised_of: Sequence[str]
     times_s: Array
     targets: Paths
     tracks: Paths
@@ -83,6 +85,7 @@ class Evaluation(NamedTuple):
         """All of it as JSON."""
         return {
             "run": self.run,
+            "centralised_of": list(self.centralised_of),
             **self.summary(),
             "each_target": [fate._asdict() for fate in self.fates],
             "duplicate_ids": self.idle.duplicates.tolist(),
@@ -115,6 +118,7 @@ def judge(run: Run, targets: Paths, times_s: Array, rules: Rules) -> Evaluation:
     holding = hold(targets, tracks, cutoff_m, p)
     return Evaluation(
         run=run.name,
+        centralised_of=run.centralised_of,
         times_s=times_s,
         targets=targets,
         tracks=tracks,

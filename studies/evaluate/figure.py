@@ -28,6 +28,7 @@ _COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, "#8a6d1a", "#4b0082", "#7a7a00")
 _PARTS = {"localisation": BLUE, "missed": ORANGE, "false": _FALSE, "cardinality": PURPLE}
 #: More tracks are not named in the plan.
 _NAMED = 40
+_DASHED = (0, (4, 2))
 #: Crosses on a false track, about.
 _MARKS = 12
 
@@ -69,20 +70,24 @@ def _extent(evaluations: Sequence[Evaluation]) -> Array:
 
 def _draw_over_time(figure: SubFigure, evaluations: Sequence[Evaluation], cutoff_m: float, window_s: float) -> None:
     gospa, ospa2, numbers = figure.subplots(3, 1, sharex=True)
-    alone = len(evaluations) == 1
-    for number, evaluation in enumerate(evaluations):
-        colour = BLACK if alone else _COLOURS[number % len(_COLOURS)]
+    names = [evaluation.run for evaluation in evaluations if not evaluation.centralised_of]
+    only = len(names) == 1
+    for evaluation in evaluations:
+        # A centralised run has the colour of its network, dashed, if there are several.
+        number = names.index((*evaluation.centralised_of, evaluation.run)[0])
+        colour = (GREEN if evaluation.centralised_of else BLACK) if only else _COLOURS[number % len(_COLOURS)]
+        alone, style = (False, _DASHED) if evaluation.centralised_of else (only, "-")
         for axes, measure in ((gospa, evaluation.gospa), (ospa2, evaluation.ospa2)):
             label = f"{evaluation.run}: mean {measure.total.mean():.1f} m"
-            axes.plot(evaluation.times_s, measure.total, color=colour, lw=2.6 if alone else 1.7, label=label)
+            axes.plot(evaluation.times_s, measure.total, color=colour, ls=style, lw=2.6 if alone else 1.7, label=label)
             if alone:
                 _draw_parts(axes, evaluation.times_s, measure._asdict())
         reported = evaluation.tracks.there.sum(axis=0)
         label = f"{evaluation.run}: confirmed tracks"
-        numbers.step(evaluation.times_s, reported, where="post", color=colour, label=label, zorder=3)
+        numbers.step(evaluation.times_s, reported, where="post", color=colour, ls=style, label=label, zorder=3)
     first = evaluations[0]
     there = first.targets.there.sum(axis=0)
-    numbers.step(first.times_s, there, where="post", color=QUIET, ls=(0, (4, 2)), label="targets", zorder=4)
+    numbers.step(first.times_s, there, where="post", color=QUIET, ls=(0, (1, 1)), label="targets", zorder=4)
     gospa.set(title=f"GOSPA, cutoff {cutoff_m:g} m", ylabel="m", ylim=(0.0, None))
     ospa2.set(title=f"OSPA(2), window {window_s:g} s", ylabel="m", ylim=(0.0, None))
     numbers.set(title="targets and confirmed tracks", xlabel="time [s]", ylim=(0.0, None))

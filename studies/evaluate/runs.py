@@ -9,9 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from common.config import Scenario
 from common.errors import EvaluationError
 from common.estimation.gaussian import Array
-from common.messages import IntArray
+from common.estimation.sprt import CONFIRMED
+from common.messages import IntArray, Tracks
 from scenarios.json_lines import identity, numbers, read_lines, seconds
 
 _STATUS = ("tentative", "confirmed", "deleted")
@@ -26,6 +28,7 @@ class Run(NamedTuple):
         ids: of tracks that were confirmed at any time, ascending, shape (N,).
         positions: while confirmed, else NaN [m], shape (N, K, d).
         span_s: first and last measurement time, with a track or without; None where nothing was measured or told.
+        centralised_of: of a centralised run, names of the runs whose plots it had; else none.
     """
 
     name: str
@@ -33,6 +36,7 @@ class Run(NamedTuple):
     ids: IntArray
     positions: Array
     span_s: tuple[float, float] | None
+    centralised_of: tuple[str, ...] = ()
 
 
 class _Line(NamedTuple):
@@ -78,7 +82,23 @@ def read_run(path: Path, d: int) -> Run:
         EvaluationError: naming file, line and reason.
     """
     file = path / "tracks.jsonl" if path.is_dir() else path
-    lines = _read_lines(file, d)
+    run = _run(path.name, _read_lines(file, d), d)
+    told = _read_span(path / "decisions.json") if path.is_dir() else None
+    return run._replace(span_s=told or run.span_s)
+
+
+def run_of(name: str, pictures: Sequence[Tracks], scenario: Scenario, d: int) -> Run:
+    """The run of a scenario with the pictures of all measurement times, by time; d: dimensions of the truth."""
+    times_s = [scenario.to_seconds(tracks.time_ns) for tracks in pictures]
+    lines = [
+        _Line(time_s, track, x[:d].tolist() if status == CONFIRMED else None)
+        for time_s, tracks in zip(times_s, pictures, strict=True)
+        for track, status, x in zip(tracks.ids.tolist(), tracks.status, tracks.x, strict=True)
+    ]
+    return _run(name, lines, d)._replace(span_s=(times_s[0], times_s[-1]) if times_s else None)
+
+
+def _run(name: str, lines: Sequence[_Line], d: int) -> Run:
     times_s = np.unique(np.array([line.time_s for line in lines]))
     confirmed = [line for line in lines if line.position is not None]
     ids, rows = np.unique(np.array([line.track for line in confirmed], dtype=np.int64), return_inverse=True)
@@ -87,8 +107,7 @@ def read_run(path: Path, d: int) -> Run:
         columns = np.searchsorted(times_s, [line.time_s for line in confirmed])
         positions[rows, columns] = [line.position for line in confirmed]
     span_s = (float(times_s[0]), float(times_s[-1])) if len(times_s) else None
-    told = _read_span(path / "decisions.json") if path.is_dir() else None
-    return Run(path.name, times_s, ids, positions, told or span_s)
+    return Run(name, times_s, ids, positions, span_s)
 
 
 def _read_lines(file: Path, d: int) -> list[_Line]:

@@ -1,0 +1,141 @@
+"""One tracker that gets the plots of all sensors: what the same steps make of them where nothing is distributed.
+
+Local filter, gate, association, start, test and end of the tracks are those of the network; the share of each track is
+the whole, so that no evolution is relaxed and no product is formed. It is the yardstick for the network.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import NamedTuple
+
+import numpy as np
+
+from common.config import Scenario
+from common.estimation.batch import take
+from common.estimation.imm import Imm
+from common.estimation.sprt import DELETED
+from common.local_filter import HONEST, LocalFilter
+from common.messages import NEVER, Decision, Report, Scan, Start, Stop, Tracks
+from common.quantities import NS_PER_S
+from fusion_center.center import given
+from fusion_center.factors import Fuser, Heard
+from fusion_center.initiation import Initiation, Unclaimed
+from fusion_center.picture import Picture, shown
+from sensor_node.state import Schedule
+from sensor_node.state import State as Filtered
+from sensor_node.tracker import LocalTracker
+
+
+class State(NamedTuple):
+    """What the tracker keeps between two measurement times.
+
+    Attributes:
+        filtered: the tracks as the filter has them.
+        picture: all tracks, with those to come and those just deleted.
+        unclaimed: plots of the last seconds that no track claims, oldest first.
+        next_id: of the next track that begins.
+    """
+
+    filtered: Filtered
+    picture: Picture
+    unclaimed: tuple[Unclaimed, ...]
+    next_id: int
+
+
+@dataclass(frozen=True)
+class Centralised:
+    """The steps of a tracker for all sensors.
+
+    Attributes:
+        names: of the sensors.
+        tracker: works in the scans of all of them.
+        fuser: of a single factor, which is the track.
+        hypotheses: the tracks given by the scenario.
+        initiation: how further tracks start; None: they do not.
+    """
+
+    names: tuple[str, ...]
+    tracker: LocalTracker
+    fuser: Fuser
+    hypotheses: Picture
+    initiation: Initiation | None
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Centralised:
+        """The tracker of a scenario, whatever its mode: what a network sends to whom has no meaning here."""
+        local = replace(LocalFilter.of(scenario, HONEST), terms=1)
+        tracker = LocalTracker.of(scenario, scenario.sensor_names[0], Schedule((), ()))
+        terms = len(local.motion.models) if isinstance(local.motion, Imm) else 1
+        whole = Fuser.of(scenario)
+        fuser = replace(whole, sensors=whole.sensors[:1], share=HONEST, terms=terms, globalised=False)
+        return cls(
+            names=scenario.sensor_names,
+            tracker=replace(tracker, filter=local, rounded=False, selection=None, buffer_ns=0, schedule=None),
+            fuser=fuser,
+            hypotheses=given(scenario, fuser),
+            initiation=Initiation.of(scenario),
+        )
+
+    def initial(self) -> State:
+        """Before the first scan."""
+        return State(self.tracker.initial(), self.hypotheses, (), len(self.hypotheses.ids))
+
+    def step(self, state: State, scans: Sequence[Scan]) -> tuple[State, list[Tracks | Decision]]:
+        """Work in all scans of one measurement time, one after the other.
+
+        Args:
+            state: before.
+            scans: of that time, at least one.
+
+        Returns:
+            the state after; what was decided, and the picture.
+        """
+        time_ns = scans[0].time_ns
+        filtered, reports = self._told(state, time_ns), list[Report]()
+        for scan in scans:
+            filtered, report = self.tracker.scan(filtered, scan, NEVER)
+            assert isinstance(report, Report), "no plots are selected"
+            reports.append(report)
+        # The last report has the evidence of all, and the tracks after all.
+        expected = self.fuser.expect(state.picture, time_ns)
+        picture, decisions = self.fuser.advance(expected, {0: Heard.of(reports[-1])})
+        state = state._replace(filtered=filtered, picture=picture)
+        if self.initiation is not None:
+            now = [Unclaimed.of(self.names.index(report.sensor), report) for report in reports]
+            state, merged = self._initiated(state, self.initiation, now)
+            decisions += merged
+        tracks = shown(state.picture, time_ns, self.names)
+        scanned = np.isin(self.names, [scan.sensor for scan in scans])
+        return state, [*decisions, tracks._replace(contributing=tracks.contributing & scanned)]
+
+    def run(self, scans: Iterable[Scan]) -> Iterator[Tracks | Decision]:
+        """Work in scans, by time; yields the picture after every measurement time, and the decisions before it."""
+        state = self.initial()
+        for _, group in groupby(scans, key=lambda scan: scan.time_ns):
+            state, said = self.step(state, list(group))
+            yield from said
+
+    def _told(self, state: State, time_ns: int) -> Filtered:
+        """The filter's tracks for the scans of a time: those that have started before and have not ended."""
+        filtered, picture = state.filtered, state.picture
+        live = (picture.status != DELETED) & (picture.starts_ns < time_ns)
+        ended = np.setdiff1d(filtered.tracks.ids, picture.ids[live])
+        filtered = self.tracker.stop(filtered, Stop("", ended))
+        new = take(picture, live & ~np.isin(picture.ids, filtered.tracks.ids))
+        density, zero = (new.x0, new.P0), np.zeros(len(new.ids))
+        return self.tracker.start(filtered, Start("", filtered.epoch, new.ids, new.starts_ns, zero, *density, *density))
+
+    def _initiated(
+        self, state: State, initiation: Initiation, now: Sequence[Unclaimed]
+    ) -> tuple[State, list[Decision]]:
+        """Give up tracks that are another one, and begin those of the plots that none claims (theory.md §8)."""
+        picture, merged = initiation.merged(state.picture)
+        density = initiation.seeds(picture, now, state.unclaimed)
+        ids, time_ns = state.next_id + np.arange(len(density.x)), now[0].time_ns
+        picture = self.fuser.begin(picture, ids, np.full(len(ids), time_ns), density)
+        oldest_ns = time_ns - round(initiation.config.within * NS_PER_S)
+        kept = (scan for scan in (*state.unclaimed, *now) if scan.time_ns >= oldest_ns)
+        return state._replace(picture=picture, unclaimed=tuple(kept), next_id=state.next_id + len(ids)), merged

@@ -13,16 +13,18 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from common.config import Scenario
-from common.estimation.gaussian import Array, BoolArray
+from common.estimation.gaussian import Array
 from common.estimation.sprt import CONFIRMED
 from common.messages import Decision, Tracks
 from scenarios.world import Truth, simulate_all, truth
+from studies.centralised import Centralised
 from studies.evaluate.holding import NONE, Holding, hold
 from studies.evaluate.paths import Paths, tracks_at
 from studies.evaluate.runs import Run
 from studies.replay import Replay
 
-Way: TypeAlias = Literal["distributed", "centralised"]
+#: With the feedback of the scenario, or without any; all plots to one tracker.
+Way: TypeAlias = Literal["distributed", "without feedback", "centralised"]
 
 
 class Outcome(NamedTuple):
@@ -53,14 +55,17 @@ def play(scenario: Scenario, way: Way, seed: int, cutoff_m: float, settled_s: fl
 
     Args:
         scenario: a network whose targets are there all the time.
-        way: nodes and center, or all plots to one tracker; the same plots.
+        way: nodes and center, or one tracker; the same plots.
         seed: of the world.
         cutoff_m: farther from a target, a track does not hold it.
         settled_s: scenario time until which tracks may start, and become one; judged is from then on.
     """
-    world = truth(scenario, seed)
     scans = simulate_all(scenario, seed)
-    return judge(scenario, world, Replay(scenario, scans).run(), cutoff_m, settled_s)
+    if way == "without feedback":
+        fusion = scenario.fusion.model_copy(update={"feedback": "none"})
+        scenario = scenario.model_copy(update={"fusion": fusion})
+    run = Centralised.of(scenario).run(scans) if way == "centralised" else Replay(scenario, scans).run()
+    return judge(scenario, truth(scenario, seed), run, cutoff_m, settled_s)
 
 
 def judge(

@@ -365,6 +365,8 @@ def _recording_faults(recording: Mapping[str, Any], sensors: list[Mapping[str, A
 
 
 def _decision_faults(decision: Mapping[str, Any]) -> Iterator[str]:
-    p0, p1 = decision.get("p0", 1e-4), decision.get("p1", 0.95)
-    if isinstance(p0, float) and isinstance(p1, float) and 0.0 < p1 <= p0 < 1.0:
-        yield f"decision.p1: {p1:g} is not above p0 = {p0:g}; no threshold lies between"
+    p0 = decision.get("p0", 1e-4)
+    for key, default in (("p1", 0.95), ("keep", 1.0)):
+        p = decision.get(key, default)
+        if isinstance(p0, float) and isinstance(p, float) and 0.0 < p <= p0 < 1.0:
+            yield f"decision.{key}: {p:g} is not above p0 = {p0:g}; no threshold lies between"

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from cyclopts import App, Parameter, validators
 from rich.console import Console
 
-bench = App(name="bench", help="Measure what a network costs on this machine: bandwidth, latency, precision.")
+bench = App(name="bench", help="Measure what a network costs on this machine: bandwidth, latency, load, precision.")
 
 Numbers = Annotated[tuple[int, ...], Parameter(negative=(), validator=validators.Number(gte=1), consume_multiple=True)]
 Count = Annotated[int, Parameter(validator=validators.Number(gte=1))]
@@ -78,6 +78,51 @@ def bandwidth(
     if figure is not None:
         draw(rows, figure)
     _finish(rows, table(rows), json_file, "eclipse-zenoh")
+
+
+@bench.command
+def tracks(
+    *,
+    targets: Numbers = (10, 100, 1000),
+    scans: Count = 8,
+    json_file: Annotated[Path | None, Parameter(name="--json")] = None,
+) -> None:
+    """CPU time of a scan against the number of tracks, which start by themselves and share plots, beside Stone Soup.
+
+    Args:
+        targets: numbers of targets.
+        scans: of every radar that are timed.
+        json_file: file to write the rows to.
+    """
+    from benchmarks.scaling import Cell, measure, table
+
+    _writable(json_file)
+    areas: tuple[Literal["grows", "same"], ...] = ("grows", "same")
+    rows = [_say(measure(Cell(number, area, scans=scans))) for area in areas for number in targets]
+    _finish(rows, table(rows), json_file, "numpy", "stonesoup")
+
+
+@bench.command
+def load(
+    scenario: str = "solent",
+    *,
+    seconds: Annotated[float, Parameter(validator=validators.Number(gt=0))] = 300.0,
+    speeds: Annotated[tuple[str, ...], Parameter(negative=(), consume_multiple=True)] = ("10", "max"),
+    json_file: Annotated[Path | None, Parameter(name="--json")] = None,
+) -> None:
+    """Which share of its time a scenario keeps a machine busy: the steps in one process, and a live network.
+
+    Args:
+        scenario: scenario file, or name of one that comes along.
+        seconds: of scenario time that the live network runs; the steps are those of the whole scenario.
+        speeds: of the live networks, one after the other.
+        json_file: file to write the rows to.
+    """
+    from benchmarks.load import live, steps, table
+
+    _writable(json_file)
+    rows = [_say(steps(scenario)), *(_say(live(scenario, speed, seconds)) for speed in speeds)]
+    _finish(rows, table(rows), json_file, "numpy", "eclipse-zenoh")
 
 
 @bench.command

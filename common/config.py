@@ -65,16 +65,24 @@ class Origin(Model):
 
 
 class DecisionConfig(Model):
-    """Wald's test: p0 accept h1 under h0, p1 accept h1 under h1; not enabled, LR is computed and nothing decided."""
+    """Wald's test.
+
+    Attributes:
+        p0: probability of accepting h1 (a target) under h0 (none).
+        p1: probability of accepting h1 under h1.
+        keep: the same for the tests of a confirmed track, one after every confirmation; default: p1.
+        enabled: if not, LR is computed and nothing decided.
+    """
 
     p0: InnerProbability = 1e-4
     p1: InnerProbability = 0.95
+    keep: InnerProbability | None = None
     enabled: bool = True
 
     @property
     def thresholds(self) -> Thresholds:
         """Log A and log B."""
-        return thresholds(self.p0, self.p1)
+        return thresholds(self.p0, self.p1, self.keep)
 
 
 class StudyConfig(Model):
@@ -397,6 +405,8 @@ def _recording_faults(recording: Mapping[str, Any], sensors: list[Mapping[str, A
 
 
 def _decision_faults(decision: Mapping[str, Any]) -> Iterator[str]:
-    p0, p1 = decision.get("p0", 1e-4), decision.get("p1", 0.95)
-    if isinstance(p0, float) and isinstance(p1, float) and 0.0 < p1 <= p0 < 1.0:
-        yield f"decision.p1: {p1:g} is not above p0 = {p0:g}; no threshold lies between"
+    p0 = decision.get("p0", 1e-4)
+    for key, default in (("p1", 0.95), ("keep", 1.0)):
+        p = decision.get(key, default)
+        if isinstance(p0, float) and isinstance(p, float) and 0.0 < p <= p0 < 1.0:
+            yield f"decision.{key}: {p:g} is not above p0 = {p0:g}; no threshold lies between"

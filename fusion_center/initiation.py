@@ -12,7 +12,7 @@ from common.config import Scenario
 from common.estimation.association import gate_threshold
 from common.estimation.gating import inside_boxes
 from common.estimation.gaussian import Array, BoolArray, Gaussian, quadratic
-from common.estimation.initiation import from_plots, with_second
+from common.estimation.initiation import apart, from_plots, with_second
 from common.estimation.motion import Motion
 from common.estimation.sensing import Measurement, Sensor
 from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE
@@ -193,13 +193,8 @@ class Initiation:
         """What is found, and what more there is that is neither near that nor near tracks."""
         d = self.motion.dimensions
         gate = gate_threshold(self.config.gate, d)
-        x, P = (np.concatenate(parts) for parts in zip(tracks, found, strict=True))
-        x, P = x[:, :d], P[:, :d, :d]
-        kept: list[int] = []
-        for row, (own_x, own_P) in enumerate(zip(more.x[:, :d], more.P[:, :d, :d], strict=True)):
-            if not (quadratic(x - own_x, P + own_P)[0] <= gate).any():
-                kept.append(row)
-                x, P = np.concatenate([x, own_x[None]]), np.concatenate([P, own_P[None]])
+        known = (np.concatenate(parts) for parts in zip(tracks, found, strict=True))
+        kept = apart(*(Gaussian(x[:, :d], P[:, :d, :d]) for x, P in (more, known)), gate)
         return Gaussian(*(np.concatenate([old, new[kept]]) for old, new in zip(found, more, strict=True)))
 
 

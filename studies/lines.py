@@ -14,6 +14,7 @@ from common.messages import Decision, Tracks
 from fusion_center.lag import FixedLag, Past
 
 _LARGEST = float(np.finfo(np.float64).max)
+_STATUS = tuple(status.name.lower() for status in Status)
 
 
 class TrackLines:
@@ -38,7 +39,7 @@ class TrackLines:
     def of(self, tracks: Tracks) -> Iterator[str]:
         """The lines of one measurement time, by track."""
         time_s = self._scenario.to_seconds(tracks.time_ns)
-        entries = {int(track): _entry(tracks, row) for row, track in enumerate(tracks.ids)}
+        entries = dict(zip(tracks.ids.tolist(), _entries(tracks), strict=True))
         if self._lag is not None:
             self._past, lagged = self._lag.step(self._past, tracks)
             for entry in entries.values():
@@ -52,14 +53,12 @@ class TrackLines:
             yield json.dumps({"time": time_s, "track": track, **entry}, allow_nan=False)
 
 
-def _entry(tracks: Tracks, row: int) -> dict[str, Any]:
-    return {
-        "status": Status(tracks.status[row]).name.lower(),
-        "log_lr": finite(tracks.log_lr[row]),
-        "log_lr_total": finite(tracks.log_lr_total[row]),
-        "x": tracks.x[row].tolist(),
-        "P": tracks.P[row].tolist(),
-    }
+def _entries(tracks: Tracks) -> Iterator[dict[str, Any]]:
+    """What is said of each track."""
+    log_lr, total = (np.clip(values, -_LARGEST, _LARGEST) for values in (tracks.log_lr, tracks.log_lr_total))
+    columns = (tracks.status, log_lr, total, tracks.x, tracks.P)
+    for status, *numbers in zip(*(column.tolist() for column in columns), strict=True):
+        yield dict(zip(("status", "log_lr", "log_lr_total", "x", "P"), (_STATUS[status], *numbers), strict=True))
 
 
 def decision_entry(decision: Decision, scenario: Scenario) -> dict[str, Any]:

@@ -250,6 +250,7 @@ FAULTS = [
     ("p1 = 0.9", "p1 = 1.0", "decision.p1: 1 is not a probability strictly between 0 and 1"),
     ("p0 = 1e-3", "p0 = 0.9", "decision.p1: 0.9 is not above p0 = 0.9; no threshold lies between"),
     ("p1 = 0.9", "p1 = 1e-4", "decision.p1: 0.0001 is not above p0 = 0.001; no threshold lies between"),
+    ("p1 = 0.9", "p1 = 0.9\nkeep = 1e-4", "decision.keep: 0.0001 is not above p0 = 0.001; no threshold lies between"),
     # initiation
     ("plots = 2", "plots = 3", "initiation.plots: 3 is not one of 1 or 2"),
     ("plots = 2", "scans = 2", "initiation.scans: is no known key"),

@@ -240,17 +240,17 @@ def within_reach(expected: Expected, plots: Plots) -> Plots:
     if plots.number is not None:
         return plots
     pairs = plots.z.shape[-2] * expected.z[0, ..., 0].size
-    if pairs <= _FEW_PAIRS or expected.gate == np.inf or expected.angular:
+    if pairs <= _FEW_PAIRS or expected.gate == np.inf or len(expected.angular) == plots.z.shape[-1]:
         return plots
     # A little more, so that rounding loses none.
     reach = np.sqrt(expected.gate) * expected.sigma[-1] * (1.0 + 1e-9)
     center = expected.z[-1]
-    if plots.z.ndim > 2:
+    if plots.z.ndim > 2 and not expected.angular:
         return _inside_common_boxes(plots, center, reach)
-    if plots.valid is not None:
+    if plots.z.ndim > 2 or plots.valid is not None:
         return plots
     *batch, m = center.shape
-    near = inside_boxes(plots.z, center.reshape(-1, m), reach.reshape(-1, m))
+    near = inside_boxes(plots.z, center.reshape(-1, m), reach.reshape(-1, m), expected.angular)
     which = near.which.reshape(*batch, -1)
     return Plots(
         plots.z[which],

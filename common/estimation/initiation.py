@@ -5,7 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from common.estimation.association import innovations
-from common.estimation.gaussian import Array, Gaussian, joseph, squared_norm, symmetric, times_transposed, whitener
+from common.estimation.gating import IntArray, inside_boxes
+from common.estimation.gaussian import (
+    Array,
+    BoolArray,
+    Gaussian,
+    joseph,
+    quadratic,
+    squared_norm,
+    symmetric,
+    times_transposed,
+    whitener,
+)
 from common.estimation.motion import Motion, predict
 from common.estimation.sensing import Measurement
 
@@ -69,3 +80,40 @@ def with_second(
     gain = times_transposed(PH, white)
     P = joseph(predicted.P, gain @ white, seen.H, seen.R)
     return Gaussian(predicted.x + np.matvec(gain, w), P), squared_norm(w)
+
+
+def apart(new: Gaussian, known: Gaussian, gate: float) -> BoolArray:
+    """Which densities are near no known one, nor near one before them that is near none.
+
+    Args:
+        new: in the order in which they count, shapes (Q, d), (Q, d, d).
+        known: shapes (T, d), (T, d, d).
+        gate: near are two whose squared Mahalanobis distance is at most this.
+
+    Returns:
+        shape (Q,).
+    """
+    free = np.ones(len(new.x), np.bool_)
+    free[_near(new, known, gate)[0]] = False
+    rows = np.flatnonzero(free)
+    left = Gaussian(new.x[rows], new.P[rows])
+    one, other = (rows[pair] for pair in _near(left, left, gate))
+    earlier = other < one
+    # In order: whoever comes first keeps those near it from starting.
+    for row, before in sorted(zip(one[earlier].tolist(), other[earlier].tolist(), strict=True)):
+        if free[before]:
+            free[row] = False
+    return free
+
+
+def _near(new: Gaussian, known: Gaussian, gate: float) -> tuple[IntArray, IntArray]:
+    """Rows of all pairs of new and known densities that are near each other, by the new ones."""
+    if not len(new.x) or not len(known.x):
+        return np.empty(0, np.intp), np.empty(0, np.intp)
+    variances = new.P.diagonal(axis1=-2, axis2=-1) + known.P.diagonal(axis1=-2, axis2=-1).max(axis=0)
+    # A little more, so that rounding loses none.
+    boxes = inside_boxes(known.x, new.x, np.sqrt(gate * variances) * (1.0 + 1e-9))
+    one, at = np.nonzero(boxes.valid)
+    other = boxes.which[one, at]
+    near = quadratic(known.x[other] - new.x[one], known.P[other] + new.P[one])[0] <= gate
+    return one[near], other[near]

@@ -31,10 +31,12 @@ class Thresholds(NamedTuple):
     Attributes:
         log_a: below: accept h0, delete.
         log_b: above: accept h1, confirm.
+        log_a_kept: the same as log_a for tracks that are confirmed; None: no other.
     """
 
     log_a: float
     log_b: float
+    log_a_kept: float | None = None
 
 
 class Verdict(NamedTuple):
@@ -53,29 +55,33 @@ class Verdict(NamedTuple):
     rejected: BoolArray
 
 
-def thresholds(p0: float, p1: float) -> Thresholds:
+def thresholds(p0: float, p1: float, keep: float | None = None) -> Thresholds:
     """Wald's thresholds (Eq. 14).
 
     Args:
         p0: probability of accepting h1 under h0.
         p1: probability of accepting h1 under h1.
+        keep: the same for the tests that follow a confirmation; None: p1.
 
     Returns:
         log A and log B.
 
     Raises:
-        ValueError: unless 0 < p0 < p1 < 1.
+        ValueError: unless 0 < p0 < p1 < 1, and the same of ``keep``.
     """
-    if not 0.0 < p0 < p1 < 1.0:
-        raise ValueError(f"p0 = {p0}, p1 = {p1}: 0 < p0 < p1 < 1 is needed, or log A < 0 < log B fails")
-    return Thresholds(float(np.log1p(-p1) - np.log1p(-p0)), float(np.log(p1) - np.log(p0)))
+    for name, p in (("p1", p1), ("keep", p1 if keep is None else keep)):
+        if not 0.0 < p0 < p < 1.0:
+            raise ValueError(f"p0 = {p0}, {name} = {p}: 0 < p0 < {name} < 1 is needed, or log A < 0 < log B fails")
+    log_a, log_a_kept = (None if p is None else float(np.log1p(-p) - np.log1p(-p0)) for p in (p1, keep))
+    assert log_a is not None
+    return Thresholds(log_a, float(np.log(p1) - np.log(p0)), log_a_kept)
 
 
 def decide(log_lr: Array, status: StatusArray, limits: Thresholds) -> Verdict:
     """One step of the test and of the monitoring that follows it (theory.md §7).
 
     Above log B a track is confirmed and its LR starts anew at 1: from then on the test monitors it, deletes it below
-    log A, and resets again whenever it is confirmed anew.
+    log A (that of kept tracks, if it is another), and resets again whenever it is confirmed anew.
 
     Args:
         log_lr: after the newest data, shape (...).
@@ -87,7 +93,8 @@ def decide(log_lr: Array, status: StatusArray, limits: Thresholds) -> Verdict:
     """
     alive = status != DELETED
     accepted = alive & (log_lr > limits.log_b)
-    rejected = alive & (log_lr < limits.log_a)
+    kept = limits.log_a if limits.log_a_kept is None else limits.log_a_kept
+    rejected = alive & (log_lr < np.where(status == CONFIRMED, kept, limits.log_a))
     new = status.copy()
     new[accepted], new[rejected] = CONFIRMED, DELETED
     return Verdict(np.where(accepted, 0.0, log_lr), new, accepted, rejected)

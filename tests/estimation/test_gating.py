@@ -9,6 +9,7 @@ from common.estimation import association
 from common.estimation.association import Clutter, Plots, expect, update, within_reach
 from common.estimation.gating import inside_boxes
 from common.estimation.gaussian import Gaussian
+from common.estimation.polar import Polar
 from common.estimation.sensing import Position
 
 SENSOR = Position((50.0, 20.0), 4)
@@ -86,3 +87,38 @@ def test_boxes_hold_what_brute_force_finds(m: int) -> None:
     for track in range(150):
         assert sorted(near.which[track][near.valid[track]]) == list(np.flatnonzero(inside[track]))
     assert near.valid.shape[1] == inside.sum(axis=1).max()
+
+
+def test_boxes_around_the_circle_hold_what_brute_force_finds() -> None:
+    rng = np.random.default_rng(4)
+    z = np.stack([rng.uniform(0, 10, 200), rng.uniform(-np.pi, np.pi, 200)], axis=-1)
+    centers = np.stack([rng.uniform(0, 10, 150), rng.uniform(-np.pi, np.pi, 150)], axis=-1)
+    centers[:5, 1] = [np.pi, -np.pi, 3.1, -3.1, 0.0]
+    reach = np.stack([rng.uniform(0, 2, 150), rng.uniform(0, 4, 150)], axis=-1)
+    near = inside_boxes(z, centers, reach, angular=(1,))
+    turned = np.abs(np.angle(np.exp(1j * (z[:, 1] - centers[:, None, 1]))))
+    inside = (np.abs(z[:, 0] - centers[:, None, 0]) <= reach[:, None, 0]) & (turned <= reach[:, None, 1])
+    for track in range(150):
+        assert sorted(near.which[track][near.valid[track]]) == list(np.flatnonzero(inside[track]))
+
+
+@pytest.mark.parametrize("stand", [[0.0, 0.0], [-4e4, 1e3]])
+def test_plots_out_of_reach_change_nothing_for_a_radar_that_sees_all_around(
+    stand: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    radar, place = Polar((15.0, 0.004), 4), np.array(stand)
+    density, z = world(300, 500)
+    z = radar.fold(radar.observe(np.hstack([z, np.zeros_like(z)]), place))
+    both = Gaussian(np.stack([density.x, density.x]), np.stack([4.0 * density.P, density.P]))
+    expected = expect(both, radar.linearise(both, place), Clutter(np.full(300, 0.9), np.array(-9.0), 0.9997))
+    near = within_reach(expected, Plots(z))
+    assert near.number is not None
+    assert near.number.shape[-1] < len(z)
+    few = update(expected, Plots(z))
+    monkeypatch.setattr(association, "_FEW_PAIRS", 10**9)
+    for got, all_of_them in zip(flat(few), flat(update(expected, Plots(z))), strict=True):
+        np.testing.assert_allclose(got, all_of_them, rtol=1e-9, atol=1e-7)
+
+
+def flat(filtered: Any) -> list[Any]:
+    return [*filtered.density, filtered.log_p_bar]

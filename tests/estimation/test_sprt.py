@@ -63,6 +63,16 @@ def test_one_step(
         np.testing.assert_array_equal(got, np.full(shape, wanted))
 
 
+def test_confirmed_tracks_are_kept_longer_where_that_is_wanted() -> None:
+    limits = thresholds(1e-4, 0.99, keep=0.999999)
+    assert limits[:2] == thresholds(1e-4, 0.99)[:2]
+    assert limits.log_a_kept == thresholds(1e-4, 0.999999).log_a
+    log_lr, status = np.array([-5.0, -5.0, -13.0, -14.0]), np.array([0, 1, 1, 1], np.uint8)
+    np.testing.assert_array_equal(decide(log_lr, status, limits).status, [2, 1, 1, 2])
+    with pytest.raises(ValueError, match="^p0 = 0.1, keep = 0.05: 0 < p0 < keep < 1 is needed"):
+        thresholds(0.1, 0.9, keep=0.05)
+
+
 def test_tracks_of_a_batch_are_decided_one_by_one() -> None:
     log_lr = np.array([10.0, -4.0, 0.0, 10.0, -4.0, 10.0])
     status = np.array([0, 0, 0, 1, 1, 2], np.uint8)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from common.estimation.gaussian import Gaussian
-from common.estimation.initiation import from_plots, with_second
+from common.estimation.initiation import apart, from_plots, with_second
 from common.estimation.motion import ConstantAcceleration, ConstantVelocity
 from common.estimation.polar import Polar, PolarDoppler
 from common.estimation.sensing import Measurement, Position
@@ -77,3 +77,21 @@ def test_two_plots_are_two_steps_of_the_kalman_filter(motion: ConstantVelocity |
 def test_no_plots_start_nothing() -> None:
     x, P = from_plots(np.empty((0, 2)), Position((50.0, 30.0), 4), STAND, SPREAD)
     assert (x.shape, P.shape) == ((0, 4), (0, 4, 4))
+
+
+@pytest.mark.parametrize("spread", [300.0, 3000.0, 1e5])
+def test_those_apart_are_what_one_after_the_other_finds(spread: float) -> None:
+    rng = np.random.default_rng(round(spread))
+    root = rng.normal(0.0, 60.0, (2, 80, 2, 2))
+    (new, known), P = rng.uniform(-spread, spread, (2, 80, 2)), root @ root.mT + np.eye(2)
+    x, covariances, expected = list(known), list(P[1]), []
+    for own_x, own_P in zip(new, P[0], strict=True):
+        nu, S = np.array(x) - own_x, np.array(covariances) + own_P
+        free = bool((np.einsum("ki,kij,kj->k", nu, np.linalg.inv(S), nu) > 9.2).all())
+        expected.append(free)
+        if free:
+            x.append(own_x)
+            covariances.append(own_P)
+    assert apart(Gaussian(new, P[0]), Gaussian(known, P[1]), 9.2).tolist() == expected
+    assert apart(Gaussian(new[:0], P[0, :0]), Gaussian(known, P[1]), 9.2).shape == (0,)
+    assert apart(Gaussian(new, P[0]), Gaussian(known[:0], P[1, :0]), 9.2).any()

@@ -22,7 +22,7 @@ from common.estimation.mixture import Mixture
 from common.estimation.representation import globalise, shrink
 from common.estimation.selection import Selection, select
 from common.estimation.sensing import Sensor
-from common.local_filter import SUREST, LocalFilter
+from common.local_filter import DOUBT, SUREST, LocalFilter
 from common.messages import Advice, Begin, IntArray, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
 from sensor_node.state import Look, Ready, Schedule, State, Tracks, alike, left, put_tracks
@@ -124,7 +124,7 @@ class LocalTracker:
         ready = self._ready(state, look.time_ns, look.position)
         mixture, free = self._filtered(self.filter, ready.mixture, ready.expected, look, ready.predicted.log_odds)
         filtered = self._with(ready.predicted, mixture)
-        maps = self._learned(state, look, free)
+        maps = self._learned(state, look, ready)
         look, unclaimed = self._unclaimed(look, free)
         if self.rounded:
             unclaimed = unclaimed.astype(np.float32).astype(np.float64)
@@ -147,14 +147,27 @@ class LocalTracker:
         relative = clutter_map.log_relative(seen, model, look.plots.z, look.position)
         return look._replace(plots=look.plots._replace(log_relative=relative))
 
-    def _learned(self, state: State, look: Look, free: Array | None) -> tuple[ClutterMap | None, ...]:
-        """The maps after a scan."""
+    def _learned(self, state: State, look: Look, ready: Ready) -> tuple[ClutterMap | None, ...]:
+        """The maps after a scan: its plots count as far as they are none of the tracks' (theory.md §13)."""
         model, seen = self.clutter[self.number], state.maps[self.number]
-        if model is None or seen is None or free is None:
+        z, stand = look.plots.z, look.position
+        if model is None or seen is None or z.ndim > 2:
             return state.maps
-        center = self.config.view_center(look.position)
-        seen = clutter_map.learn(seen, model, look.plots.z, free, look.time_ns, look.position, center)
+        near = self.filter.near(ready.expected, look.plots, self.sensor, stand)
+        claiming = self._claiming(ready.predicted.log_odds)
+        _, false = self.filter.shared(ready.mixture, ready.expected, near, len(z), self.sensor, stand, claiming)
+        seen = clutter_map.learn(seen, model, z, false, look.time_ns, stand, self.config.view_center(stand))
         return (*state.maps[: self.number], seen, *state.maps[self.number + 1 :])
+
+    def _claiming(self, log_odds: Array) -> Array:
+        """Probability that tracks exist, as far as they keep plots from the map, shape (T,).
+
+        Where tracks start, what stands still begins like a target: a track must have more evidence than that. What a
+        sensor that starts none is told of, others have found: it is no less probable than not.
+        """
+        if self.claimed is not None:
+            return np.asarray(expit(log_odds - DOUBT))
+        return np.asarray(expit(np.where(log_odds > -np.inf, np.maximum(log_odds, 0.0), log_odds)))
 
     def _unclaimed(self, look: Look, free: Array | None) -> tuple[Look, Array]:
         """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""
@@ -359,27 +372,12 @@ class LocalTracker:
     ) -> tuple[Mixture, Array | None]:
         """Tracks after a scan, and the probability of each plot to be that of none; None: not asked for."""
         near, free = local.near(expected, look.plots, self.sensor, look.position), None
-        wanted = self._existence_counts or (self.joint and len(log_odds) > 1)
+        wanted = self.claimed is not None or (self.joint and len(log_odds) > 1)
         if wanted and look.plots.z.ndim == 2:
-            plots, existence = len(look.plots.z), self._existence(log_odds)
+            plots, existence = len(look.plots.z), expit(log_odds)
             shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
             near = shared if self.joint else near
         return local.update(predicted, expected, near, self.sensor, look.position), free
-
-    def _existence(self, log_odds: Array) -> Array:
-        """Probability of tracks to exist, before a scan.
-
-        What a sensor that starts no tracks is told of, others have found: by itself it holds that for no less probable
-        than not, or its map would take the plots of a target that was late to be found for false ones for ever.
-        """
-        if self.claimed is None and self.clutter[self.number] is not None:
-            log_odds = np.where(log_odds > -np.inf, np.maximum(log_odds, 0.0), log_odds)
-        return np.asarray(expit(log_odds))
-
-    @property
-    def _existence_counts(self) -> bool:
-        """Whether what plots belong to none of the tracks is asked for."""
-        return self.claimed is not None or self.clutter[self.number] is not None
 
     def _predict(self, tracks: Tracks, t_ns: int) -> tuple[Mixture, Array]:
         mixture = self._mixture(tracks)
@@ -433,7 +431,7 @@ class LocalTracker:
 
     def _believed(self, tracks: Tracks, log_g: Array) -> Array:
         """Log odds of existence after the evidence since, where they are asked for."""
-        if not self.joint and not self._existence_counts:
+        if not self.joint and self.claimed is None and self.clutter[self.number] is None:
             return tracks.log_odds
         with np.errstate(invalid="ignore"):  # what was impossible stays so
             gain = log_sum_exp(log_g) - log_sum_exp(tracks.log_g)

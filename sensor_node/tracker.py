@@ -154,20 +154,17 @@ class LocalTracker:
         if model is None or seen is None or z.ndim > 2:
             return state.maps
         near = self.filter.near(ready.expected, look.plots, self.sensor, stand)
-        claiming = self._claiming(ready.predicted.log_odds)
+        # Where tracks start, what stands still begins like a target: a claim takes more evidence than that.
+        claiming = self._existing(ready.predicted.log_odds - (0.0 if self.claimed is None else DOUBT))
         _, false = self.filter.shared(ready.mixture, ready.expected, near, len(z), self.sensor, stand, claiming)
         seen = clutter_map.learn(seen, model, z, false, look.time_ns, stand, self.config.view_center(stand))
         return (*state.maps[: self.number], seen, *state.maps[self.number + 1 :])
 
-    def _claiming(self, log_odds: Array) -> Array:
-        """Probability that tracks exist, as far as they keep plots from the map, shape (T,).
-
-        Where tracks start, what stands still begins like a target: a track must have more evidence than that. What a
-        sensor that starts none is told of, others have found: it is no less probable than not.
-        """
-        if self.claimed is not None:
-            return np.asarray(expit(log_odds - DOUBT))
-        return np.asarray(expit(np.where(log_odds > -np.inf, np.maximum(log_odds, 0.0), log_odds)))
+    def _existing(self, log_odds: Array) -> Array:
+        """Probability that tracks exist, shape (T,): with a map, what others found is no less probable than not."""
+        if self.claimed is None and self.clutter[self.number] is not None:
+            log_odds = np.where(log_odds > -np.inf, np.maximum(log_odds, 0.0), log_odds)
+        return np.asarray(expit(log_odds))
 
     def _unclaimed(self, look: Look, free: Array | None) -> tuple[Look, Array]:
         """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""
@@ -374,7 +371,7 @@ class LocalTracker:
         near, free = local.near(expected, look.plots, self.sensor, look.position), None
         wanted = self.claimed is not None or (self.joint and len(log_odds) > 1)
         if wanted and look.plots.z.ndim == 2:
-            plots, existence = len(look.plots.z), expit(log_odds)
+            plots, existence = len(look.plots.z), self._existing(log_odds)
             shared, free = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence)
             near = shared if self.joint else near
         return local.update(predicted, expected, near, self.sensor, look.position), free

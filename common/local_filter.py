@@ -33,6 +33,8 @@ from common.estimation.visibility import seen
 HONEST = Share(1.0)
 #: Log odds of existence go no farther than this, so that a target that has gone is soon believed to be.
 SUREST = 7.0
+#: Log odds, at the start of a track, of a thing that stands still against a target, for a map of false plots.
+DOUBT = 5.0
 
 
 class Left(NamedTuple):

@@ -14,7 +14,7 @@ from common.estimation.clutter_map import ClutterMap, ClutterModel
 from common.estimation.gaussian import Array
 from common.estimation.mixture import Mixture
 from common.estimation.sensing import Sensor
-from common.local_filter import Left, LocalFilter
+from common.local_filter import DOUBT, Left, LocalFilter
 from sensor_node.state import Look, Tracks
 
 
@@ -30,6 +30,7 @@ class Sight:
         joint: tracks that share plots are associated jointly (Eq. 21).
         claimed: a plot that belongs to the tracks with at least this probability starts none; None: none does.
         min_speed: targets are faster [m/s].
+        dimensions: of space.
     """
 
     config: SensorConfig
@@ -39,6 +40,7 @@ class Sight:
     joint: bool
     claimed: float | None
     min_speed: float
+    dimensions: int
 
     @classmethod
     def of(cls, scenario: Scenario, number: int) -> Sight:
@@ -53,6 +55,7 @@ class Sight:
             joint=scenario.joint,
             claimed=None if initiation is None or config.kind == "bearing" else initiation.claimed,
             min_speed=0.0 if initiation is None else initiation.min_speed,
+            dimensions=motion.dimensions,
         )
 
     @property
@@ -87,20 +90,30 @@ class Sight:
         near = local.near(expected, look.plots, self.sensor, look.position)
         if look.plots.z.ndim > 2 or not (self.sharing or (self.joint and len(log_odds) > 1)):
             return near, None
-        plots, existence = len(look.plots.z), self._existence(log_odds)
-        target = _moving(predicted, len(look.position), self.min_speed) if self.min_speed > 0.0 else None
-        shared, left = local.shared(predicted, expected, near, plots, self.sensor, look.position, existence, target)
+        plots, odds = len(look.plots.z), self._told(log_odds)
+        shared, left = local.shared(predicted, expected, near, plots, self.sensor, look.position, expit(odds))
+        if self.clutter is not None and self.claimed is not None:
+            # What stands still begins like a target and has evidence like one (theory.md §13).
+            doubted, target = expit(odds - DOUBT), self._moving(predicted)
+            _, known = local.shared(predicted, expected, near, plots, self.sensor, look.position, doubted, target)
+            left = left._replace(false=known.false)
         return shared if self.joint else near, left
 
-    def _existence(self, log_odds: Array) -> Array:
-        """Probability of tracks to exist, before a scan.
-
-        What a sensor that starts no tracks is told of, others have found: by itself it holds that for no less probable
-        than not, or its map would take the plots of a target that was late to be found for false ones for ever.
-        """
+    def _told(self, log_odds: Array) -> Array:
+        """Log odds of tracks to exist: with a map, what others found is no less probable than not, shape (T,)."""
         if self.claimed is None and self.clutter is not None:
             log_odds = np.where(log_odds > -np.inf, np.maximum(log_odds, 0.0), log_odds)
-        return np.asarray(expit(log_odds))
+        return log_odds
+
+    def _moving(self, predicted: Mixture) -> Array | None:
+        """Probability of each track to be faster than targets are at least, along its course, shape (T,)."""
+        if self.min_speed == 0.0:
+            return None
+        w, (x, P), d = np.exp(predicted.log_w), predicted.density, self.dimensions
+        velocity = np.vecmat(w, x[-1, ..., d : 2 * d])
+        variance = np.vecdot(w, P[-1].diagonal(axis1=-2, axis2=-1)[..., d : 2 * d].mean(axis=-1))
+        faster: Array = ndtr((np.linalg.vector_norm(velocity, axis=-1) - self.min_speed) / np.sqrt(variance))
+        return faster
 
     def filter(
         self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
@@ -152,12 +165,3 @@ class Sight:
         if look.plots.log_relative is not None and self.config.clutter_map is not None:
             quiet &= look.plots.log_relative < np.log(self.config.clutter_map.start_below)
         return look, z[quiet]
-
-
-def _moving(predicted: Mixture, d: int, min_speed: float) -> Array:
-    """Probability of each track to be faster than ``min_speed`` [m/s], along its estimated course, shape (T,)."""
-    w, (x, P) = np.exp(predicted.log_w), predicted.density
-    velocity = np.vecmat(w, x[-1, ..., d : 2 * d])
-    variance = np.vecdot(w, P[-1].diagonal(axis1=-2, axis2=-1)[..., d : 2 * d].mean(axis=-1))
-    faster: Array = ndtr((np.linalg.vector_norm(velocity, axis=-1) - min_speed) / np.sqrt(variance))
-    return faster

@@ -1,4 +1,4 @@
-"""A map of false plots, learned scan by scan: where they come again and again, they are dense (theory.md §14).
+"""A map of false plots, learned scan by scan: where they come again and again, they are dense (theory.md §13).
 
 The number of false plots per scan in a cell is Poisson with a rate of its own; all rates have the same Gamma prior,
 with the uniform density of the sensor as its mean. Earlier scans are forgotten exponentially. What is told is a density

@@ -61,11 +61,10 @@ def play_all(jobs: Sequence[Job], workers: int, file: Path) -> None:
 
 def played(file: Path) -> dict[Job, Outcome]:
     """The runs of a file."""
-    found = {}
+    found: dict[Job, Outcome] = {}
     for line in file.read_text(encoding="utf-8").splitlines() if file.exists() else ():
         entry = json.loads(line)
-        job, outcome = (kind(*(entry[key] for key in kind._fields)) for kind in (Job, Outcome))
-        found[job] = outcome
+        found[Job(*map(entry.get, Job._fields))] = Outcome(*map(entry.get, Outcome._fields))
     return found
 
 

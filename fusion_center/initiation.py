@@ -193,8 +193,9 @@ class Initiation:
         """What is found, and what more there is that is neither near that nor near tracks."""
         d = self.motion.dimensions
         gate = gate_threshold(self.config.gate, d)
-        known = (np.concatenate(parts) for parts in zip(tracks, found, strict=True))
-        kept = apart(*(Gaussian(x[:, :d], P[:, :d, :d]) for x, P in (more, known)), gate)
+        known = Gaussian(*(np.concatenate(parts) for parts in zip(tracks, found, strict=True)))
+        new, known = (Gaussian(x[:, :d], P[:, :d, :d]) for x, P in (more, known))
+        kept = apart(new, known, gate)
         return Gaussian(*(np.concatenate([old, new[kept]]) for old, new in zip(found, more, strict=True)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,7 @@ from matplotlib.text import Annotation
 from common.config import BoxConfig, DiscConfig, SectorConfig, SensorConfig
 from common.estimation.gaussian import Array
 from common.estimation.sprt import Status
+from common.messages import Decision
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,6 +27,8 @@ COLOUR = {Status.TENTATIVE: "#8a6d1a", Status.CONFIRMED: "#0b7a3b", Status.DELET
 _SENSOR = "#1f4e9e"
 #: Covariance ellipses of a track, at most.
 _ELLIPSES = 12
+#: Of more tracks only those that were ever confirmed are drawn: most others are of false plots.
+_MOST_TRACKS = 200
 #: Rays of bearings, as a share of the picture.
 _RAY = 0.2
 #: 95 % of a 2-D Gaussian lie within this many standard deviations.
@@ -36,7 +40,8 @@ def draw_log_lr(record: Record, path: Path) -> None:
     figure = Figure(figsize=(13, 6), layout="constrained")
     FigureCanvasAgg(figure)
     decided, whole = figure.subplots(1, 2, sharey=True)
-    curves = {track: (*_with_resets(record, track, h), h) for track, h in record.histories().items()}
+    histories = record.histories()
+    curves = {track: (*_with_resets(record, track, h), h) for track, h in _drawn(histories).items()}
     # A run that was cut short may have heard of a decision and not of its track.
     standing = [decision for decision in record.standing() if decision.track in curves]
     first = {d.track: record.scenario.to_seconds(d.time_ns) for d in reversed(standing)}
@@ -48,20 +53,26 @@ def draw_log_lr(record: Record, path: Path) -> None:
         _label(decided, f" {track}", (times[:until][-1], log_lr[:until][-1]), colour)
         whole.plot(times, log_lr, color=colour, lw=0.7)
     for axes in (decided, whole):
-        _draw_test(axes, record)
+        _draw_test(axes, record, standing)
     decided.set(ylabel="log LR since the last reset", title=f"{record.scenario.name}: until the first decision")
     whole.set(title="the whole run: confirmed tracks are monitored, their LR reset at log B")
     if first:
         start_s = min(times[0] for times, _, _ in curves.values())
         decided.set_xlim(start_s, start_s + 1.15 * (max(first.values()) - start_s))
-    decided.legend(handles=_status_handles(record), fontsize=9, loc="upper left")
+    decided.legend(handles=_status_handles(histories), fontsize=9, loc="upper left")
     figure.savefig(path, dpi=110)
 
 
-def _draw_test(axes: Axes, record: Record) -> None:
+def _drawn(histories: Mapping[int, History]) -> dict[int, History]:
+    """The tracks to draw."""
+    few = len(histories) <= _MOST_TRACKS
+    return {track: h for track, h in histories.items() if few or (h.status == Status.CONFIRMED).any()}
+
+
+def _draw_test(axes: Axes, record: Record, decisions: Sequence[Decision]) -> None:
     """Thresholds and decisions."""
     limits = record.scenario.decision.thresholds
-    for decision in record.standing():
+    for decision in decisions:
         confirmed = decision.kind == "confirmed"
         colour = COLOUR[Status.CONFIRMED if confirmed else Status.DELETED]
         time_s = record.scenario.to_seconds(decision.time_ns)
@@ -90,9 +101,10 @@ def draw_plan(record: Record, path: Path) -> None:
     _draw_plots(axes, record)
     for sensor in record.scenario.sensors:
         _draw_sensor(axes, record, sensor)
-    for track, history in record.histories().items():
+    histories = record.histories()
+    for track, history in _drawn(histories).items():
         _draw_track(axes, track, history)
-    handles = [*axes.get_legend_handles_labels()[0], *_status_handles(record)]
+    handles = [*axes.get_legend_handles_labels()[0], *_status_handles(histories)]
     axes.legend(handles=handles, fontsize=9, loc="upper right")
     axes.set(xlabel="east [m]", ylabel="north [m]", title=f"{record.scenario.name}: plan view, 95 % ellipses")
     axes.set_aspect("equal", adjustable="datalim")
@@ -198,9 +210,11 @@ def _ellipse(center: Array, P: Array, colour: str) -> Ellipse:
     return Ellipse(tuple(center), width, height, angle=angle, fill=False, ec=colour, alpha=0.6, zorder=4)
 
 
-def _status_handles(record: Record) -> list[Patch]:
-    there = [Status(int(history.status[-1])) for history in record.histories().values()]
-    return [
+def _status_handles(histories: Mapping[int, History]) -> list[Patch]:
+    there = [Status(int(history.status[-1])) for history in histories.values()]
+    hidden = len(histories) - len(_drawn(histories))
+    rest = [Patch(color="none", label=f"{hidden} never confirmed, not drawn")] if hidden else []
+    return rest + [
         Patch(color=COLOUR[status], label=f"{there.count(status)} {status.name.lower()}")
         for status in (Status.CONFIRMED, Status.TENTATIVE, Status.DELETED)
         if status in there

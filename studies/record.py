@@ -95,7 +95,9 @@ class Record:
     def summary(self, extra: Mapping[str, Any]) -> dict[str, Any]:
         """Decisions and outcome as JSON."""
         limits = self.scenario.decision.thresholds
-        decisions = [decision_entry(decision, self.scenario) for decision in self.standing()]
+        decisions: dict[int, list[dict[str, Any]]] = {}
+        for decision in self.standing():
+            decisions.setdefault(decision.track, []).append(decision_entry(decision, self.scenario))
         times = [self.scenario.to_seconds(time_ns) for time_ns in self.pictures]
         return {
             "scenario": self.scenario.name,
@@ -111,7 +113,7 @@ class Record:
                     "log_lr_total": finite(history.log_lr_total[-1]),
                     "last_time": float(history.times_s[-1]),
                     "x": history.x[-1].tolist(),
-                    "decisions": [d for d in decisions if d["track"] == track],
+                    "decisions": decisions.get(track, []),
                 }
                 for track, history in self.histories().items()
             ],

@@ -83,7 +83,7 @@ def draw_log_lr(scene: Scene) -> Figure:
 
 def _zoom(axes: Axes, scene: Scene, variant: str) -> None:
     """To the stretch in which the means of most modes are between the thresholds."""
-    log_a, log_b = scene.limits
+    log_a, log_b, _ = scene.limits
     lasts = []
     for mode in scene.modes:
         rows = rows_of(scene.outcome.curves, variant=variant, mode=mode)

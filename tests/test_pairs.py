@@ -105,7 +105,8 @@ def test_targets_keep_their_tracks(name: str) -> None:
 
 def test_runs_are_read_back_and_counted(tmp_path: Path) -> None:
     file = tmp_path / "pairs.jsonl"
-    good, bad = Outcome(False, False, 0, 0, 20.0), Outcome(True, True, 2, 1, 40.0)
+    good = Outcome(swapped=False, lost=False, breaks=0, false_tracks=0, rmse_m=20.0)
+    bad = Outcome(swapped=True, lost=True, breaks=2, false_tracks=1, rmse_m=40.0)
     outcomes = {Job("parallel", "distributed", seed): bad if seed == 3 else good for seed in range(10)}
     lines = [json.dumps({**job._asdict(), **outcome._asdict()}) for job, outcome in outcomes.items()]
     file.write_text("\n".join(lines))

@@ -69,7 +69,7 @@ def test_confirmed_tracks_are_kept_longer_where_that_is_wanted() -> None:
     assert limits.log_a_kept == thresholds(1e-4, 0.999999).log_a
     log_lr, status = np.array([-5.0, -5.0, -13.0, -14.0]), np.array([0, 1, 1, 1], np.uint8)
     np.testing.assert_array_equal(decide(log_lr, status, limits).status, [2, 1, 1, 2])
-    with pytest.raises(ValueError, match="^p0 = 0.1, keep = 0.05: 0 < p0 < keep < 1 is needed"):
+    with pytest.raises(ValueError, match=r"^p0 = 0\.1, keep = 0\.05: 0 < p0 < keep < 1 is needed"):
         thresholds(0.1, 0.9, keep=0.05)
 
 

@@ -54,6 +54,9 @@ def initiation_faults(initiation: object, window: Any, kinds: Sequence[Any]) -> 
         return
     if kinds and all(kind == "bearing" for kind in kinds):
         yield "initiation: no sensor tells a position, so that no track can start; all are of kind 'bearing'"
+    slowest, fastest = initiation.get("min_speed", 0.0), initiation.get("max_speed")
+    if isinstance(slowest, int | float) and isinstance(fastest, int | float) and slowest >= fastest > 0.0:
+        yield f"initiation.min_speed: {slowest:g} is not below max_speed, {fastest:g}"
     within = initiation.get("within", 0.0)
     if isinstance(within, int | float) and isinstance(window, int | float) and within > window:
         yield f"initiation.within: {within} s is longer than the {window} s (fusion.window) that reports are kept"

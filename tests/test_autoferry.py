@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from common.config import load_scenario
+from common.config import Scenario, load_scenario
 from common.messages import Tracks
 from scenarios import catalogue
 from scenarios.autoferry import measure
@@ -139,20 +140,38 @@ def test_all_four_sensors_are_there(number: int) -> None:
     assert {scan.sensor for scan in all_scans(loaded)} == set(loaded.sensor_names)
 
 
-@pytest.mark.parametrize("number", [2, 5])
+def nearness(plot: Scenario, number: int, until_s: float) -> Iterator[dict[int, list[bool]]]:
+    """After every measurement time, which boats each confirmed track is closer to than 30 m."""
+    boats = read_truth(FOLDER / f"scenario{number}-truth.jsonl").values()
+    scans = [scan for scan in all_scans(plot) if scan.time_ns <= plot.to_ns(until_s)]
+    for picture in Replay(plot, scans).run():
+        if isinstance(picture, Tracks):
+            time_s, confirmed = plot.to_seconds(picture.time_ns), picture.status == 1
+            there = np.array([[np.interp(time_s, boat.times_s, axis) for axis in boat.positions.T] for boat in boats])
+            near = np.linalg.norm(picture.x[confirmed, None, :2] - there, axis=-1) < 30.0
+            yield dict(zip(picture.ids[confirmed].tolist(), near.tolist(), strict=True))
+
+
+def most_held(pictures: Iterable[dict[int, list[bool]]]) -> int:
+    """How many boats are held at a time."""
+    return max(sum(map(any, zip(*near.values(), strict=True))) for near in pictures)
+
+
+@pytest.mark.parametrize("number", [2, 3, 5])
 def test_in_open_water_the_network_finds_both_boats_itself(number: int) -> None:
     """Within ten scans of the radar, 17 s, both are held by confirmed tracks at the same time."""
-    loaded = load_scenario(catalogue.find(f"autoferry-{number}-all"))
-    boats = read_truth(FOLDER / f"scenario{number}-truth.jsonl")
-    until_ns = loaded.to_ns(17.0)
-    scans = [scan for scan in all_scans(loaded) if scan.time_ns <= until_ns]
-    held = set()
-    for picture in Replay(loaded, scans).run():
-        if isinstance(picture, Tracks):
-            confirmed, time_s = picture.x[picture.status == 1, :2], loaded.to_seconds(picture.time_ns)
-            there = [
-                [np.interp(time_s, boat.times_s, boat.positions[:, axis]) for axis in (0, 1)] for boat in boats.values()
-            ]
-            near = np.linalg.norm(confirmed[:, None] - np.array(there), axis=-1) < 30.0
-            held.add(int(near.any(axis=0).sum()))
-    assert max(held) == 2
+    plot = load_scenario(catalogue.find(f"autoferry-{number}-all"))
+    assert most_held(nearness(plot, number, 17.0)) == 2
+
+
+def test_in_the_canal_maps_leave_less_than_a_third_of_the_false_tracks() -> None:
+    """And both boats are held at the same time, as without them."""
+    plot = load_scenario(catalogue.find("autoferry-13-all"))
+    bare = tuple(sensor.model_copy(update={"clutter_map": None}) for sensor in plot.sensors)
+    false = []
+    for variant in (plot, plot.model_copy(update={"sensors": bare})):
+        pictures = list(nearness(variant, 13, 118.0))
+        assert most_held(pictures) == 2
+        held = {track for near in pictures for track, boats in near.items() if any(boats)}
+        false.append(len({track for near in pictures for track in near} - held))
+    assert false[0] < false[1] / 3

@@ -20,6 +20,7 @@ from scipy.optimize import linear_sum_assignment
 from common.estimation.gaussian import Array
 from common.estimation.sight import to_polar
 from scenarios.autoferry.convert import CAMERAS, SCENARIOS
+from scenarios.autoferry.persistence import LAG_S, Watch, correlation, fitted, watches
 
 #: Up to where a boat is looked for [m].
 REACH = {"radar": 500.0, "lidar": 125.0, "infrared": 300.0, "daylight": 300.0}
@@ -33,6 +34,14 @@ _BY_SCENARIO = (
     *("false plots", "bias [m, rad]", "sigma [m, rad]", "directions [°]"),
 )
 _BY_SENSOR = ("sensor", "reach [m]", "p_d", "shadowed", "after a miss", "false plots", "bias [m, rad]", "rms [m, rad]")
+_BY_PERSISTENCE = (
+    "sensor",
+    "p_d while visible",
+    "visible [s]",
+    "hidden [s]",
+    "gained per scan",
+    f"errors {LAG_S:.0f} s later",
+)
 
 
 class Boat(NamedTuple):
@@ -133,6 +142,27 @@ def by_range(sensor: str, looks: Sequence[Look]) -> list[str]:
     return [sensor, *(_p_d(boat for boat in boats if low <= boat.range < high) for low, high in classes)]
 
 
+def by_persistence(sensor: str, recordings: Iterable[Sequence[Look]]) -> list[str]:
+    """A row: how long boats are visible and hidden, and how errors persist."""
+    seen = [watch for looks in recordings for boat in (0, 1) for watch in _watches(sensor, looks, boat)]
+    persistence, again = fitted(seen), correlation(seen)
+    return [
+        sensor,
+        f"{persistence.p_d:.2f}",
+        *(f"{time_s:.0f}" for time_s in persistence.visibility),
+        f"{persistence.gained:.2f}",
+        "-" if np.isnan(again) else f"{again:.2f}",
+    ]
+
+
+def _watches(sensor: str, looks: Sequence[Look], boat: int) -> list[Watch]:
+    boats = [look.boats[boat] for look in looks]
+    none = np.full(1 if sensor in CAMERAS else 2, np.nan)
+    errors = np.array([none if boat.error is None else boat.error for boat in boats])
+    within = np.array([boat.range < REACH[sensor] for boat in boats])
+    return watches(np.array([look.time_s for look in looks]), within, errors)
+
+
 def tables(folder: Path) -> str:
     """All tables, in Markdown."""
     looks = {(sensor, number): compare(folder, number, sensor) for sensor in REACH for number in SCENARIOS}
@@ -141,7 +171,10 @@ def tables(folder: Path) -> str:
     first = _table(_BY_SCENARIO, (by_scenario(*key, seen) for key, seen in looks.items()))
     second = _table(_BY_SENSOR, (by_sensor(*item) for item in pooled.items()))
     third = _table(["p_d", *ranges], (by_range(*item) for item in pooled.items()))
-    return "\n".join([*first, "", *second, "", *third])
+    fourth = _table(
+        _BY_PERSISTENCE, (by_persistence(sensor, (looks[sensor, number] for number in SCENARIOS)) for sensor in REACH)
+    )
+    return "\n".join([*first, "", *second, "", *third, "", *fourth])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

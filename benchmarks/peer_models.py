@@ -56,8 +56,12 @@ class Eye(NamedTuple):
         return self.config.kind != "bearing"
 
 
-def eyes_of(scenario: Scenario) -> dict[str, Eye]:
-    """All sensors.
+def eyes_of(scenario: Scenario, bearing_sigma: float = 1.0) -> dict[str, Eye]:
+    """All sensors, by name.
+
+    Args:
+        scenario: the network.
+        bearing_sigma: factor on the noise of bearings.
 
     Raises:
         ConfigError: for what the peer is not built for.
@@ -65,7 +69,12 @@ def eyes_of(scenario: Scenario) -> dict[str, Eye]:
     if scenario.motion.dimensions != 2 or scenario.motion.model != "cv":
         raise ConfigError(f"{scenario.name}: the peer tracks with constant velocity in two dimensions")
     motion = scenario.motion.build()
-    return {sensor.name: _eye(sensor, sensor.build(motion)) for sensor in scenario.sensors}
+    sensors = [_noisier(each, bearing_sigma) if each.kind == "bearing" else each for each in scenario.sensors]
+    return {sensor.name: _eye(sensor, sensor.build(motion)) for sensor in sensors}
+
+
+def _noisier(config: SensorConfig, factor: float) -> SensorConfig:
+    return config.model_copy(update={"sigma": tuple(factor * sigma for sigma in config.sigma)})
 
 
 def _eye(config: SensorConfig, model: Sensor) -> Eye:
@@ -137,7 +146,7 @@ def _spread(eye: Eye, z: Array) -> float:
 
 
 class Nearby:
-    """A hypothesiser of Stone Soup that is asked about the plots that may be in the gate only: the same answers, sooner.
+    """A hypothesiser of Stone Soup, asked only about plots that may be in the gate: the same answers, sooner.
 
     Plots of a hypothesiser of probabilities count with the density of false plots where they lie.
     """
@@ -177,9 +186,10 @@ def place_of(state: Any) -> Array:
     return np.asarray(state.state_vector, np.float64)[list(PLACE), 0]
 
 
-def x_of(state: Any) -> list[float]:
-    """East, north and their rates."""
-    return [float(value) for value in np.asarray(state.state_vector, np.float64)[[0, 2, 1, 3], 0]]
+def x_of(state: Any, later_s: float = 0.0) -> list[float]:
+    """East, north and their rates, some time later if nothing happens."""
+    east, east_rate, north, north_rate = np.asarray(state.state_vector, np.float64)[:, 0].tolist()
+    return [east + later_s * east_rate, north + later_s * north_rate, east_rate, north_rate]
 
 
 def absorb(track: Any, hypotheses: Any, updater: Any, *, counts: bool) -> set[Any]:

@@ -18,10 +18,10 @@ from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from datetime import datetime, timedelta
 from itertools import groupby
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 from scipy.stats import chi2
 from stonesoup.dataassociator.neighbour import GNNWith2DAssignment
 from stonesoup.dataassociator.probability import JPDAwithEHM2
@@ -65,6 +65,7 @@ class Settings(NamedTuple):
         p_d: factor on the sensors' p_d.
         clutter: factor on the sensors' density of false plots.
         bearings: "ignore" them, let them "steer" tracks only, or "keep" tracks alive too.
+        bearing_sigma: factor on the noise of bearings, whose errors go on from scan to scan.
     """
 
     min_points: int = 6
@@ -76,6 +77,7 @@ class Settings(NamedTuple):
     p_d: float = 1.0
     clutter: float = 1.0
     bearings: str = "ignore"
+    bearing_sigma: float = 1.0
 
 
 class PeerTracker:
@@ -84,7 +86,7 @@ class PeerTracker:
     def __init__(self, scenario: Scenario, settings: Settings) -> None:
         """Set up Stone Soup's components for a scenario."""
         self._scenario, self._settings = scenario, settings
-        self._eyes = eyes_of(scenario)
+        self._eyes = eyes_of(scenario, settings.bearing_sigma)
         self._predictor = predictor_of(scenario)
         self._associators = {name: self._associator(eye) for name, eye in self._eyes.items()}
         self._initiator = self._initiation()
@@ -145,12 +147,13 @@ class PeerTracker:
     def lines(self, t_ns: int) -> Iterator[dict[str, Any]]:
         """All tracks at a time, and those held that were worked on then."""
         time = instant(self._scenario, t_ns)
-        held = [track for track in self._initiator.holding_tracks if track.timestamp == time]
+        held = {track for track in self._initiator.holding_tracks if track.timestamp == time}
         for status, tracks in (("confirmed", self._tracks), ("tentative", held)):
-            for track in sorted(tracks, key=lambda each: self._number(each)):
-                state = self._predictor.predict(track, timestamp=time)
-                entry = {"time": self._scenario.to_seconds(t_ns), "track": self._number(track), "status": status}
-                yield {**entry, "x": x_of(state)}
+            for number, track in sorted(
+                ((self._number(each), each) for each in sorted(tracks, key=x_of)), key=itemgetter(0)
+            ):
+                entry = {"time": self._scenario.to_seconds(t_ns), "track": number, "status": status}
+                yield {**entry, "x": x_of(track, (time - track.timestamp).total_seconds())}
 
     def _number(self, track: Any) -> int:
         return self._numbers.setdefault(track.id, len(self._numbers))
@@ -161,7 +164,7 @@ def run(scenario: Scenario, scans: Sequence[Scan], settings: Settings) -> Iterat
 
     Args:
         scenario: the network.
-        scans: by time.
+        scans: by time; also those of sensors that the settings ignore, to say where tracks are then.
         settings: of the tracker.
     """
     tracker = PeerTracker(scenario, settings)

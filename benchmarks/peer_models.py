@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from datetime import datetime, timedelta
+from itertools import compress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,7 @@ from common.quantities import NS_PER_S
 
 #: Where a state has east and north, and their order for angles.
 PLACE, NORTH_FIRST = (0, 2), (2, 0)
+_NOWHERE = np.full(2, np.nan)
 #: A plot this many times farther from a track than its gate reaches is not even looked at.
 _FAR = 1.5
 
@@ -112,7 +114,7 @@ def detections_of(eye: Eye, scan: Scan, time: datetime) -> set[Any]:
             vector_of(eye, z),
             timestamp=time,
             measurement_model=model,
-            metadata={"density": rho, "place": place if eye.locates else None, "spread": _spread(eye, z)},
+            metadata={"density": rho, "place": place if eye.locates else _NOWHERE, "spread": _spread(eye, z)},
         )
         for z, rho, place in zip(scan.z, density, places, strict=True)
     }
@@ -160,6 +162,7 @@ class Nearby:
             clutter: factor on the density of false plots; None: the hypothesiser knows no probabilities.
         """
         self._inner, self._gate, self._clutter = inner, gate, clutter
+        self._asked: tuple[Any, list[Any], Array, Array] = (None, [], np.empty((0, 2)), np.empty(0))
 
     def hypothesise(self, track: Any, detections: Collection[Any], timestamp: datetime, **options: Any) -> Any:
         """All hypotheses of a track."""
@@ -173,12 +176,20 @@ class Nearby:
         return found
 
     def _near(self, prediction: Any, detections: Collection[Any]) -> Iterator[Any]:
-        at, spread = place_of(prediction), float(np.trace(prediction.covar[np.ix_(PLACE, PLACE)]))
-        for detection in detections:
-            place = detection.metadata["place"]
-            reach = self._gate * (spread + detection.metadata["spread"]) * _FAR**2
-            if place is None or np.sum((place - at) ** 2) <= reach:
-                yield detection
+        if detections is not self._asked[0] or len(detections) != len(self._asked[1]):
+            self._asked = (detections, list(detections), *_places(detections))
+        _, listed, places, spreads = self._asked
+        spread = float(np.trace(prediction.covar[np.ix_(PLACE, PLACE)]))
+        reach = self._gate * (spread + spreads) * _FAR**2
+        near = ~(np.square(places - place_of(prediction)).sum(axis=-1) > reach)
+        return compress(listed, near)
+
+
+def _places(detections: Collection[Any]) -> tuple[Array, Array]:
+    """Where plots lie, and the mean square errors; NaN where they do not tell, shapes (M, 2), (M,)."""
+    places = [detection.metadata["place"] for detection in detections]
+    spreads = np.array([detection.metadata["spread"] for detection in detections])
+    return np.array(places).reshape(-1, 2), spreads
 
 
 def place_of(state: Any) -> Array:

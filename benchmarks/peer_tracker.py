@@ -198,12 +198,13 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="a setting other than tuned")
     parser.add_argument("--tune", choices=TUNED, help="search the settings of these scenarios")
     parser.add_argument("--seconds", type=float, help="of each scenario to tune on; default: all")
-    parser.add_argument("--json", type=Path, help="file to write everything tried to")
+    parser.add_argument("--json", type=Path, help="file of everything tried; default runs/tune-FAMILY.json")
     arguments = parser.parse_args()
     if arguments.tune:
         from benchmarks.peer_tuning import tune
 
-        tune(arguments.tune, changed(TUNED[arguments.tune], arguments.set), arguments.seconds, arguments.json)
+        out = arguments.json or Path(f"runs/tune-{arguments.tune}.json")
+        tune(arguments.tune, changed(TUNED[arguments.tune], arguments.set), arguments.seconds, out)
         return
     if arguments.scenario is None:
         parser.error("a scenario, or --tune")

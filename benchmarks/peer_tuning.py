@@ -34,14 +34,14 @@ FAMILIES = {
 
 #: What is tried, in this order.
 GRID: dict[str, tuple[Any, ...]] = {
-    "min_points": (4, 6, 8, 11, 15, 20),
-    "holding_s": (2.0, 3.0, 5.0, 8.0),
-    "deleter_s": (2.0, 3.5, 5.0, 8.0),
-    "clutter": (0.3, 1.0, 3.0, 10.0),
-    "p_d": (0.6, 0.8, 1.0),
+    "min_points": (4, 6, 8, 11, 15, 20, 30),
+    "holding_s": (2.0, 3.0, 5.0, 8.0, 12.0),
+    "deleter_s": (1.0, 2.0, 3.5, 5.0, 8.0),
     "gate": (0.95, 0.99, 0.999),
     "holding_gate": (2.0, 3.0, 4.0),
     "max_sigma_m": (10.0, 20.0, 30.0),
+    "clutter": (0.3, 1.0, 3.0, 10.0, 100.0),
+    "p_d": (0.6, 0.8, 1.0),
 }
 _ROUNDS = 2
 
@@ -55,14 +55,22 @@ class Task(NamedTuple):
     times_s: Array
 
 
-def tune(family: str, first: Settings, seconds: float | None, out: Path | None) -> None:
-    """Search, and say what was found."""
+def tune(family: str, first: Settings, seconds: float | None, out: Path) -> None:
+    """Search, and say what was found.
+
+    Args:
+        family: of the scenarios.
+        first: settings to begin with.
+        seconds: of each scenario; None: all.
+        out: file of what was tried; what is in it already is not tried again.
+    """
     tasks = [_task(name, seconds) for name in FAMILIES[family]]
-    tried: dict[Settings, list[float]] = {}
+    tried = _read(out)
 
     def score(settings: Settings) -> float:
         if settings not in tried:
             tried[settings] = [gospa(task, settings) for task in tasks]
+            _write(out, tried)
             _say(settings, tried[settings], first)
         return float(np.mean(tried[settings]))
 
@@ -78,9 +86,17 @@ def tune(family: str, first: Settings, seconds: float | None, out: Path | None) 
     for number, task in enumerate(tasks):
         alone = min(tried, key=lambda settings: tried[settings][number])
         print(f"best for {task.scenario.name} alone: {tried[alone][number]:.2f} m with {_difference(alone, best)}")
-    if out is not None:
-        entries = [{"settings": settings._asdict(), "gospa_m": values} for settings, values in tried.items()]
-        out.write_text(json.dumps(entries, indent=1) + "\n")
+
+
+def _read(file: Path) -> dict[Settings, list[float]]:
+    entries = json.loads(file.read_text(encoding="utf-8")) if file.exists() else []
+    return {Settings(**entry["settings"]): entry["gospa_m"] for entry in entries}
+
+
+def _write(file: Path, tried: dict[Settings, list[float]]) -> None:
+    entries = [{"settings": settings._asdict(), "gospa_m": values} for settings, values in tried.items()]
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
 
 
 def _task(name: str, seconds: float | None) -> Task:

@@ -32,17 +32,26 @@ FAMILIES = {
     "solent": ("solent",),
 }
 
-#: What is tried, in this order.
-GRID: dict[str, tuple[Any, ...]] = {
+#: What is tried, in this order. A track of the ferry's radar alone (1.68 s) must outlive one scan interval.
+_FERRY: dict[str, tuple[Any, ...]] = {
     "min_points": (4, 6, 8, 11, 15, 20, 30),
     "holding_s": (2.0, 3.0, 5.0, 8.0, 12.0),
-    "deleter_s": (1.0, 2.0, 3.5, 5.0, 8.0),
+    "deleter_s": (2.0, 3.5, 5.0, 8.0, 12.0),
     "gate": (0.95, 0.99, 0.999),
     "holding_gate": (2.0, 3.0, 4.0),
     "max_sigma_m": (10.0, 20.0, 30.0),
     "clutter": (0.3, 1.0, 3.0, 10.0, 100.0),
     "p_d": (0.6, 0.8, 1.0),
 }
+#: Radars that see 20 km far are less sharp than a ferry's.
+_SHIPS: dict[str, tuple[Any, ...]] = {
+    "min_points": (2, 3, 4, 5, 8, 12),
+    "holding_s": (2.0, 3.5, 5.0),
+    "deleter_s": (6.0, 10.0, 20.0),
+    "max_sigma_m": (60.0, 150.0),
+    "gate": (0.95, 0.99),
+}
+GRID = {"autoferry": _FERRY, "solent": _SHIPS}
 _ROUNDS = 2
 
 
@@ -77,7 +86,7 @@ def tune(family: str, first: Settings, seconds: float | None, out: Path) -> None
     best = first
     for _ in range(_ROUNDS):
         begin = best
-        for name, values in GRID.items():
+        for name, values in GRID[family].items():
             best = min([best, *(best._replace(**{name: value}) for value in values)], key=score)
         if best == begin:
             break

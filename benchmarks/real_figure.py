@@ -42,22 +42,27 @@ def draw(scenario: Scenario, scans: Sequence[Scan], evaluations: Sequence[Evalua
     """
     plots, stands = _plots(scenario, scans), _stands(scans)
     low, high = _extent(evaluations, stands)
-    width = 5.2 * len(evaluations)
-    height = 5.2 * float(np.clip((high - low)[1] / (high - low)[0], 0.55, 1.5)) + 1.3
+    columns = len(evaluations) if len(evaluations) < 4 else -(-len(evaluations) // 2)
+    rows = -(-len(evaluations) // columns)
+    width = 5.2 * columns
+    height = 5.2 * rows * float(np.clip((high - low)[1] / (high - low)[0], 0.55, 1.5)) + 1.3
     with mpl.rc_context(SETTINGS):
         figure = Figure(figsize=(max(width, 7.0), height), layout="constrained")
         FigureCanvasAgg(figure)
-        panels = figure.subplots(1, len(evaluations), squeeze=False, sharex=True, sharey=True)[0]
-        for axes, evaluation in zip(panels, evaluations, strict=True):
+        panels = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+        for axes, evaluation in zip(panels, evaluations, strict=False):
             axes.plot(plots[:, 0], plots[:, 1], ".", ms=_dot(len(plots)), mew=0, color=_PLOT, zorder=1)
             _draw_truth(axes, evaluation, stands)
             _draw_tracks(axes, evaluation)
             axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east [m]")
             axes.set_title(f"{evaluation.run}: GOSPA {evaluation.gospa.total.mean():.1f} m")
             axes.set_aspect("equal", adjustable="box")
-        panels[0].set_ylabel("north [m]")
+        for axes in panels[::columns]:
+            axes.set_ylabel("north [m]")
+        for axes in panels[len(evaluations) :]:
+            axes.remove()
         figure.suptitle(scenario.name, x=0.01, ha="left", fontweight="bold")
-        figure.legend(handles=_handles(stands), loc="outside lower left", ncols=min(len(evaluations), 3), fontsize=9)
+        figure.legend(handles=_handles(stands), loc="outside lower left", ncols=min(columns, 3), fontsize=9)
         figure.savefig(path, dpi=110)
 
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.machine import described
-from benchmarks.peer_tracker import tuned
+from benchmarks.peer_tracker import early
 from benchmarks.real_figure import draw
 from benchmarks.real_truth import rules_of, times_of, truth_of
 from common.config import Scenario, load_scenario
@@ -38,7 +38,7 @@ from studies.evaluate.table import SUMMARY, said
 
 SCENARIOS = (*(f"autoferry-{number}-all" for number in (2, 3, 5, 13, 16)), "solent")
 OUT, IMAGES = Path("runs/real"), Path("docs/images")
-PEER = "Stone Soup"
+PEER, EARLY_PEER = "Stone Soup", "Stone Soup, early"
 
 #: More rows of a table, and after which of the summary's.
 _MORE = {"  after [s], mean": ("  after [radar scans]", "{confirmed_after_radar_scans:.1f}")}
@@ -85,9 +85,11 @@ def trackers(scenario: Scenario, file: Path, folder: Path) -> dict[str, list[str
         folder: to write a scenario to that has no bearings.
     """
     waldnet = str(Path(sys.executable).with_name("waldnet"))
-    peer = {PEER: [sys.executable, "-m", "benchmarks.peer_tracker", scenario.name]}
+    peers = {PEER: [sys.executable, "-m", "benchmarks.peer_tracker", scenario.name]}
+    if changes := early(scenario):
+        peers[EARLY_PEER] = [*peers[PEER], *(word for change in changes for word in ("--set", change))]
     if scenario.initiation is None and not scenario.hypotheses:
-        return peer  # nothing would start a track
+        return peers  # nothing would start a track
     variants = {"waldnet": str(file)}
     if any(sensor.kind == "bearing" for sensor in scenario.sensors):
         variants["waldnet, no bearings"] = str(without_bearings(scenario, file, folder))
@@ -95,7 +97,7 @@ def trackers(scenario: Scenario, file: Path, folder: Path) -> dict[str, list[str
     told = subprocess.run([waldnet, "replay", "--help"], capture_output=True, text=True, check=True).stdout
     if "--centralised" in told:
         commands["waldnet, centralised"] = [*commands["waldnet"], "--centralised"]
-    return commands | peer
+    return commands | peers
 
 
 def without_bearings(scenario: Scenario, file: Path, folder: Path) -> Path:
@@ -144,13 +146,13 @@ def _children_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _peer_depends_on(scenario: Scenario) -> str:
-    """A digest of plots, settings and versions; of decision and fusion the peer knows nothing."""
+def _peer_depends_on(scenario: Scenario, command: Sequence[str]) -> str:
+    """A digest of plots, settings, code and version; of decision and fusion the peer knows nothing."""
     speed = None if scenario.initiation is None else scenario.initiation.speed
     told = scenario.model_dump_json(include={"epoch", "motion", "sensors", "simulation"})
     plots = b"" if scenario.recording is None else scenario.recording.plots.read_bytes()
     source = b"".join(Path(__file__).with_name(f"{name}.py").read_bytes() for name in ("peer_models", "peer_tracker"))
-    whole = f"{told} {speed} {tuned(scenario)} {version('stonesoup')}".encode() + plots + source
+    whole = f"{told} {speed} {command[1:]} {version('stonesoup')}".encode() + plots + source
     return hashlib.sha256(whole).hexdigest()[:16]
 
 
@@ -162,7 +164,8 @@ def play(name: str) -> dict[str, Tracked]:
     scans, found = all_scans(scenario), {}
     for tracker, command in trackers(scenario, file, folder).items():
         print(f"{name}: {tracker}", file=sys.stderr)
-        lines, cpu_s = track(tracker, command, folder, _peer_depends_on(scenario) if tracker == PEER else None)
+        peer = tracker in (PEER, EARLY_PEER)
+        lines, cpu_s = track(tracker, command, folder, _peer_depends_on(scenario, command) if peer else None)
         found[tracker] = _judged(scenario, scans, tracker, lines, cpu_s)
     noted = {tracker: each.summary for tracker, each in found.items()}
     (folder / "summary.json").write_text(json.dumps(noted, indent=1) + "\n")

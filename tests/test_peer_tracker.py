@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
@@ -17,7 +18,7 @@ from stonesoup.types.state import GaussianState
 
 from benchmarks.peer_models import detections_of, eyes_of, instant, start_of, x_of
 from benchmarks.peer_tracker import PeerTracker, Settings, changed, run, tuned
-from benchmarks.real_runs import without_bearings
+from benchmarks.real_runs import table, track, without_bearings
 from benchmarks.real_truth import rules_of, times_of, truth_of
 from common.config import Scenario, load_scenario
 from common.errors import ConfigError
@@ -187,3 +188,31 @@ def test_truths_of_recorded_and_of_simulated_scenarios() -> None:
     assert (rules_of(ferry).cutoff_m, rules_of(ships).cutoff_m) == (30.0, 100.0)
     scans = [Scan("calshot", ships.to_ns(t), np.zeros(2), np.empty((0, 2))) for t in (2.0, 1.0, 2.0, 1e6)]
     assert times_of(ships, scans, known).tolist() == [1.0, 2.0]
+
+
+def test_tracks_are_kept_as_long_as_they_hold(tmp_path: Path) -> None:
+    """A tracker's lines are written anew, unless they depend on what they did."""
+
+    def said(text: str, kept_for: str | None) -> str:
+        file, cpu_s = track("Stone Soup, early", [sys.executable, "-c", f"print({text!r})"], tmp_path, kept_for)
+        assert file.name == "stone-soup-early.jsonl"
+        assert cpu_s > 0.0
+        return file.read_text().strip()
+
+    assert said("one", "a") == "one"
+    assert said("two", "a") == "one"
+    assert said("three", "b") == "three"
+    assert said("four", None) == "four"
+
+
+def test_a_table_says_all_measures_and_a_dash_for_none() -> None:
+    nothing = dict.fromkeys(("confirmed_after_s", "confirmed_after_radar_scans", "held_share", "rmse_m"))
+    parts = dict.fromkeys(("total", "localisation", "missed", "false", "cardinality"), 1.0)
+    counts = dict.fromkeys(("targets", "confirmed_targets", "breaks", "swaps", "confirmed_tracks"), 0)
+    tracks = {"false_tracks": 0, "duplicates": 0, "false_tracks_per_minute": 0.5, "cpu_s": 12.0}
+    summary = {**nothing, **counts, **tracks, "gospa_m": parts, "ospa2_m": parts}
+    head, _, *rows = table({"one": summary, "two": {**summary, "rmse_m": 3.25}})
+    assert head == "| | one | two |"
+    assert "| RMSE while held [m] | - | 3.2 |" in rows
+    assert "| &nbsp;&nbsp;after [radar scans] | - | - |" in rows
+    assert rows[-1] == "| computing time [s] | 12 | 12 |"

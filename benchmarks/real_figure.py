@@ -54,13 +54,16 @@ def draw(scenario: Scenario, scans: Sequence[Scan], evaluations: Sequence[Evalua
             axes.plot(plots[:, 0], plots[:, 1], ".", ms=_dot(len(plots)), mew=0, color=_PLOT, zorder=1)
             _draw_truth(axes, evaluation, stands)
             _draw_tracks(axes, evaluation)
-            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), xlabel="east [m]")
+            axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
             axes.set_title(f"{evaluation.run}: GOSPA {evaluation.gospa.total.mean():.1f} m")
             axes.set_aspect("equal", adjustable="box")
         for axes in panels[::columns]:
             axes.set_ylabel("north [m]")
         for axes in panels[len(evaluations) :]:
             axes.remove()
+        for axes in panels[: len(evaluations)][-columns:]:
+            axes.set_xlabel("east [m]")
+            axes.tick_params(labelbottom=True)
         figure.suptitle(scenario.name, x=0.01, ha="left", fontweight="bold")
         figure.legend(handles=_handles(stands), loc="outside lower left", ncols=min(columns, 3), fontsize=9)
         figure.savefig(path, dpi=110)

@@ -1,7 +1,8 @@
 """Real scenarios, tracked by waldnet and by a peer on the same plots, and judged by the truth: docs/real-runs.md.
 
-    python -m benchmarks.real_runs SCENARIO     # track anew; prints a table, draws docs/images/SCENARIO.png
-    python -m benchmarks.real_runs overview     # what was found last of all scenarios; tracks those that were not yet
+    python -m benchmarks.real_runs SCENARIO            # track anew; prints a table, draws docs/images/SCENARIO.png
+    python -m benchmarks.real_runs SCENARIO --kept     # judge and draw again what was tracked last
+    python -m benchmarks.real_runs overview            # what was found last; tracks scenarios that were not yet
 
 Every tracker is a process of its own that writes its tracks to runs/real/SCENARIO; its computing time is all that it
 took of a processor, start included. The peer's tracks are kept as long as nothing changes that it depends on.
@@ -113,24 +114,28 @@ def without_bearings(scenario: Scenario, file: Path, folder: Path) -> Path:
     return written
 
 
-def track(name: str, command: Sequence[str], folder: Path, kept_for: str | None) -> tuple[Path, float]:
+def track(
+    name: str, command: Sequence[str], folder: Path, kept_for: str | None, *, kept: bool = False
+) -> tuple[Path, float]:
     """Run a tracker.
 
     Args:
         name: of the tracker.
         command: prints its tracks.
         folder: to write them to.
-        kept_for: on what the tracks depend: those of before are taken if it is the same; None: they never are.
+        kept_for: on what the tracks depend: those of before are taken if it is the same; None: they are not.
+        kept: take those of before anyway.
 
     Returns:
         the file of tracks, and the seconds of a processor that they took.
     """
     file = folder / f"{name.lower().replace(', ', '-').replace(' ', '-')}.jsonl"
     note = file.with_suffix(".note.json")
-    if kept_for is not None and file.exists() and note.exists():
+    if note.exists():
         told = json.loads(note.read_text())
-        if told["kept_for"] == kept_for:
-            return file, told["cpu_s"]
+        if kept or (kept_for is not None and told["kept_for"] == kept_for):
+            return file, float(told["cpu_s"])
+    note.unlink(missing_ok=True)
     before = _children_s()
     # One thread: several are no faster with matrices of four rows, and would count as computing time.
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
@@ -156,16 +161,21 @@ def _peer_depends_on(scenario: Scenario, command: Sequence[str]) -> str:
     return hashlib.sha256(whole).hexdigest()[:16]
 
 
-def play(name: str) -> dict[str, Tracked]:
-    """Track a scenario with all trackers, draw the figure, and note what was found."""
+def play(name: str, *, kept: bool = False) -> dict[str, Tracked]:
+    """Track a scenario with all trackers, draw the figure, and note what was found.
+
+    Args:
+        name: of the scenario.
+        kept: take all tracks as they were, where they are there.
+    """
     file, folder = find(name), OUT / name
     scenario = load_scenario(file)
     folder.mkdir(parents=True, exist_ok=True)
     scans, found = all_scans(scenario), {}
     for tracker, command in trackers(scenario, file, folder).items():
         print(f"{name}: {tracker}", file=sys.stderr)
-        peer = tracker in (PEER, EARLY_PEER)
-        lines, cpu_s = track(tracker, command, folder, _peer_depends_on(scenario, command) if peer else None)
+        same = _peer_depends_on(scenario, command) if tracker in (PEER, EARLY_PEER) else None
+        lines, cpu_s = track(tracker, command, folder, same, kept=kept)
         found[tracker] = _judged(scenario, scans, tracker, lines, cpu_s)
     noted = {tracker: each.summary for tracker, each in found.items()}
     (folder / "summary.json").write_text(json.dumps(noted, indent=1) + "\n")
@@ -213,11 +223,13 @@ def main() -> None:
     """Print the table of one scenario, or the overview."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=(*SCENARIOS, "overview"))
-    what = parser.parse_args().what
+    parser.add_argument("--kept", action="store_true", help="judge and draw again what was tracked last")
+    arguments = parser.parse_args()
+    what: str = arguments.what
     if what == "overview":
         print(*overview(), sep="\n")
         return
-    found = play(what)
+    found = play(what, kept=arguments.kept)
     print(described("waldnet", "numpy", "stonesoup"), end="\n\n")
     print(*table({tracker: each.summary for tracker, each in found.items()}), sep="\n")
     print(f"\n![plots, truth and confirmed tracks of {what}](images/{what}.png)")

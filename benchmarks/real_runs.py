@@ -39,6 +39,8 @@ from studies.evaluate.table import SUMMARY, said
 
 SCENARIOS = (*(f"autoferry-{number}-all" for number in (2, 3, 5, 13, 16)), "solent")
 OUT, IMAGES = Path("runs/real"), Path("docs/images")
+#: Simulated scenarios are looked at for so long, or a peer would take most of the time of all.
+_DURATION_S = 600.0
 PEER, EARLY_PEER = "Stone Soup", "Stone Soup, early"
 
 #: More rows of a table, and after which of the summary's.
@@ -86,7 +88,7 @@ def trackers(scenario: Scenario, file: Path, folder: Path) -> dict[str, list[str
         folder: to write a scenario to that has no bearings.
     """
     waldnet = str(Path(sys.executable).with_name("waldnet"))
-    peers = {PEER: [sys.executable, "-m", "benchmarks.peer_tracker", scenario.name]}
+    peers = {PEER: [sys.executable, "-m", "benchmarks.peer_tracker", str(file)]}
     if changes := early(scenario):
         peers[EARLY_PEER] = [*peers[PEER], *(word for change in changes for word in ("--set", change))]
     if scenario.initiation is None and not scenario.hypotheses:
@@ -99,6 +101,20 @@ def trackers(scenario: Scenario, file: Path, folder: Path) -> dict[str, list[str
     if "--centralised" in told:
         commands["waldnet, centralised"] = [*commands["waldnet"], "--centralised"]
     return commands | peers
+
+
+def shorter(file: Path, folder: Path) -> Path:
+    """The file of a scenario; where it is simulated, one that is like it and ends sooner."""
+    scenario = load_scenario(file)
+    if scenario.simulation is None or scenario.simulation.duration <= _DURATION_S:
+        return file
+    text = re.sub(r"^duration = .*$", f"duration = {_DURATION_S}", file.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    if scenario.simulation.truth is not None:
+        truth = f"truth = {json.dumps(str(scenario.simulation.truth.resolve()))}"
+        text = re.sub(r"^truth = .*$", lambda _: truth, text, flags=re.MULTILINE)
+    written = folder / "shorter.toml"
+    written.write_text(text, encoding="utf-8")
+    return written
 
 
 def without_bearings(scenario: Scenario, file: Path, folder: Path) -> Path:
@@ -157,7 +173,7 @@ def _peer_depends_on(scenario: Scenario, command: Sequence[str]) -> str:
     told = scenario.model_dump_json(include={"epoch", "motion", "sensors", "simulation"})
     plots = b"" if scenario.recording is None else scenario.recording.plots.read_bytes()
     source = b"".join(Path(__file__).with_name(f"{name}.py").read_bytes() for name in ("peer_models", "peer_tracker"))
-    whole = f"{told} {speed} {command[1:]} {version('stonesoup')}".encode() + plots + source
+    whole = f"{told} {speed} {command[4:]} {version('stonesoup')}".encode() + plots + source
     return hashlib.sha256(whole).hexdigest()[:16]
 
 
@@ -168,9 +184,10 @@ def play(name: str, *, kept: bool = False) -> dict[str, Tracked]:
         name: of the scenario.
         kept: take all tracks as they were, where they are there.
     """
-    file, folder = find(name), OUT / name
-    scenario = load_scenario(file)
+    folder = OUT / name
     folder.mkdir(parents=True, exist_ok=True)
+    file = shorter(find(name), folder)
+    scenario = load_scenario(file)
     scans, found = all_scans(scenario), {}
     for tracker, command in trackers(scenario, file, folder).items():
         print(f"{name}: {tracker}", file=sys.stderr)

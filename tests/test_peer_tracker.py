@@ -18,7 +18,7 @@ from stonesoup.types.state import GaussianState
 
 from benchmarks.peer_models import detections_of, eyes_of, instant, start_of, x_of
 from benchmarks.peer_tracker import PeerTracker, Settings, changed, run, tuned
-from benchmarks.real_runs import table, track, without_bearings
+from benchmarks.real_runs import shorter, table, track, without_bearings
 from benchmarks.real_truth import rules_of, times_of, truth_of
 from common.config import Scenario, load_scenario
 from common.errors import ConfigError
@@ -178,6 +178,15 @@ def test_the_ferry_without_cameras(tmp_path: Path) -> None:
     assert bare.sensor_names == ("radar", "lidar")
     assert bare.recording is not None
     assert bare.recording.ignore == ("infrared", "daylight")
+
+
+def test_simulated_scenarios_are_shortened(tmp_path: Path) -> None:
+    assert shorter(find("autoferry-2-all"), tmp_path) == find("autoferry-2-all")
+    short = load_scenario(shorter(find("solent"), tmp_path))
+    assert short.simulation is not None
+    assert short.simulation.duration == 600.0
+    assert short.sensors == load_scenario(find("solent")).sensors
+    assert short.name == "solent"
 
 
 def test_truths_of_recorded_and_of_simulated_scenarios() -> None:

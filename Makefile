@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check lock bench figures studies clean
+.PHONY: help setup demo test check lock bench figures studies real clean
 
 help: ## what can be made
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## /  make \1\t/'
@@ -53,6 +53,9 @@ figures: $(VENV)/test.stamp ## measure all figures of docs/performance.md anew (
 
 studies: $(VENV)/test.stamp ## play all studies of docs/studies.md anew (an hour)
 	$(BIN)/python -m benchmarks.figures docs/studies.md
+
+real: $(VENV)/test.stamp ## track the recorded scenarios of docs/real-runs.md anew, with waldnet and a peer (a quarter of an hour)
+	$(BIN)/python -m benchmarks.figures docs/real-runs.md
 
 clean: ## remove what was made
 	rm -rf $(VENV) runs .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build *.egg-info

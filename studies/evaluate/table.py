@@ -12,7 +12,7 @@ from studies.evaluate.evaluation import Evaluation, Rules
 from studies.evaluate.holding import TargetFate
 
 #: Rows of the summary: what it says, and how it is said of a summary.
-_SUMMARY = (
+SUMMARY = (
     ("GOSPA [m]", "{gospa_m[total]:.1f}"),
     ("  localisation", "{gospa_m[localisation]:.1f}"),
     ("  missed", "{gospa_m[missed]:.1f}"),
@@ -60,8 +60,8 @@ def show(console: Console, evaluations: Sequence[Evaluation], rules: Rules) -> N
     for evaluation in evaluations:
         grid.add_column(evaluation.run, justify="right")
     summaries = [evaluation.summary() for evaluation in evaluations]
-    for heading, form in _SUMMARY:
-        grid.add_row(heading, *(_said(form, summary) for summary in summaries))
+    for heading, form in SUMMARY:
+        grid.add_row(heading, *(said(form, summary) for summary in summaries))
     console.print(grid)
     for evaluation in evaluations:
         if evaluation.fates:
@@ -75,11 +75,11 @@ def _targets(run: str, fates: Sequence[TargetFate]) -> Grid:
         grid.add_column(heading, justify="right")
     for fate in fates:
         values = {**fate._asdict(), "tracks": ", ".join(map(str, fate.ids)) or None}
-        grid.add_row(*(_said(form, values) for _, form in _FATE))
+        grid.add_row(*(said(form, values) for _, form in _FATE))
     return grid
 
 
-def _said(form: str, values: dict[str, Any]) -> str:
+def said(form: str, values: dict[str, Any]) -> str:
     """A value for people; a dash for none."""
     name = form[1:].partition(":")[0].rstrip("}")
     return "-" if name in values and values[name] is None else form.format(**values)

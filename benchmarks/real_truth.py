@@ -1,0 +1,51 @@
+"""Where the targets of recorded scenarios truly were, and when runs are judged by it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from common.config import Scenario
+from common.errors import TruthError
+from common.estimation.gaussian import Array
+from common.messages import Scan
+from scenarios.truth import Whereabouts, read_truth
+from scenarios.world import truth
+from sensor_node.sources import seed_of
+from studies.evaluate.evaluation import Rules
+
+
+def truth_of(scenario: Scenario) -> dict[int, Whereabouts]:
+    """The truth beside a scenario's recording, or that of its simulated world.
+
+    Raises:
+        TruthError: when there is none.
+    """
+    if scenario.recording is not None:
+        plots = scenario.recording.plots
+        return read_truth(plots.with_name(f"{plots.stem}-truth.jsonl"), (scenario.motion.dimensions,))
+    if scenario.simulation is None:
+        raise TruthError(f"{scenario.name}: has neither [recording] nor [simulation], so no truth")
+    world = truth(scenario, seed_of(scenario, None))
+    times_s = np.array([scenario.to_seconds(int(t_ns)) for t_ns in world.times_ns])
+    places = world.x[..., : scenario.motion.dimensions]
+    there = np.atleast_2d(np.isfinite(places).all(axis=-1))
+    return {
+        number: Whereabouts(times_s[there[number]], places[number, there[number]])
+        for number in np.flatnonzero(there.any(axis=-1)).tolist()
+    }
+
+
+def rules_of(scenario: Scenario) -> Rules:
+    """How runs are judged: a ferry's radar and lidar are sharper than radars that see 20 km far."""
+    return Rules(cutoff_m=30.0 if scenario.recording is not None else 100.0)
+
+
+def times_of(scenario: Scenario, scans: Sequence[Scan], known: dict[int, Whereabouts]) -> Array:
+    """The times of all scans, from the first to the last point of the truth [s]."""
+    first_s = min(target.times_s[0] for target in known.values())
+    last_s = max(target.times_s[-1] for target in known.values())
+    times_s: Array = np.unique(np.array([scenario.to_seconds(scan.time_ns) for scan in scans]))
+    judged: Array = times_s[(times_s >= first_s) & (times_s <= last_s)]
+    return judged

@@ -48,11 +48,13 @@ bench: $(VENV)/test.stamp ## speed of the estimator beside Stone Soup, and of th
 	$(BIN)/python benchmarks/estimator.py
 	$(BIN)/python benchmarks/steps.py
 
-figures: $(VENV)/test.stamp ## measure all figures of docs/performance.md anew (half an hour, needs root)
+figures: $(VENV)/test.stamp ## measure all figures of docs/performance.md and many-targets.md anew (half an hour, needs root)
 	$(BIN)/python -m benchmarks.figures docs/performance.md
+	$(BIN)/python -m benchmarks.figures docs/many-targets.md bench
 
-studies: $(VENV)/test.stamp ## play all studies of docs/studies.md anew (an hour)
+studies: $(VENV)/test.stamp ## play all studies of docs/studies.md and the pairs of many-targets.md anew (an hour and a half)
 	$(BIN)/python -m benchmarks.figures docs/studies.md
+	$(BIN)/python -m benchmarks.figures docs/many-targets.md pairs
 
 real: $(VENV)/test.stamp ## track the recorded scenarios of docs/real-runs.md anew, with waldnet and a peer (a quarter of an hour)
 	$(BIN)/python -m benchmarks.figures docs/real-runs.md

@@ -250,9 +250,8 @@ def _log_one_and_others(values: Array, at: tuple[IntArray, IntArray]) -> Array:
         values: logarithms, shape (N,).
         at: row and column of each, shape (N,).
     """
-    size = (int(part.max(initial=-1)) + 1 for part in at)
-    table = np.pad(np.full(tuple(size), -np.inf), ((0, 0), (1, 1)), constant_values=-np.inf)
     row, column = at
+    table = np.full((int(row.max(initial=-1)) + 1, int(column.max(initial=-1)) + 3), -np.inf)
     table[:, 0] = 0.0
     table[row, column + 1] = values
     left, right = np.logaddexp.accumulate(table, axis=1), np.logaddexp.accumulate(table[:, ::-1], axis=1)[:, ::-1]

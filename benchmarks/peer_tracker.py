@@ -174,8 +174,8 @@ def run(scenario: Scenario, scans: Sequence[Scan], settings: Settings) -> Iterat
         yield from tracker.lines(t_ns)
 
 
-#: What ``--tune`` found: mean GOSPA of 20.4 m over the five recordings of the ferry (22.4 m with 11 points, 23.2 m with
-#: 8); 101 m over the first 120 s of the Solent (106 m with 4 points, 127 m with 5).
+#: What a search like ``--tune`` found: mean GOSPA of 20.4 m over the five recordings of the ferry, where the best with
+#: 8 points had 23.2 m; 101 m over the first 120 s of the Solent, 106 m with 4 points.
 TUNED = {
     "autoferry": Settings(min_points=30, holding_s=3.0, deleter_s=8.0),
     "solent": Settings(min_points=3, holding_s=3.5, deleter_s=10.0, max_sigma_m=150.0, gate=0.95),

@@ -227,3 +227,8 @@ def absorb(track: Any, hypotheses: Any, updater: Any, *, counts: bool) -> set[An
     else:
         track.append(GaussianStatePrediction(mean, covariance, time))
     return claimed
+
+
+def seen_share(sensor: Sensor) -> float:
+    """Of the scans, in how many a target is detected: the peer takes targets for visible all the time."""
+    return sensor.p_d if sensor.visibility is None else sensor.p_d * sensor.visibility.share

@@ -43,6 +43,7 @@ from benchmarks.peer_models import (
     instant,
     place_of,
     predictor_of,
+    seen_share,
     start_of,
     x_of,
 )
@@ -105,7 +106,7 @@ class PeerTracker:
             self._predictor,
             eye.updater,
             clutter_spatial_density=1.0,
-            prob_detect=min(settings.p_d * eye.model.p_d, 0.999),
+            prob_detect=min(settings.p_d * seen_share(eye.model), 0.999),
             prob_gate=gate,
             normalise=False,
         )

@@ -41,6 +41,8 @@ SCENARIOS = (*(f"autoferry-{number}-all" for number in (2, 3, 5, 13, 16)), "sole
 OUT, IMAGES = Path("runs/real"), Path("docs/images")
 #: Simulated scenarios are looked at for so long, or a peer would take most of the time of all.
 _DURATION_S = 600.0
+#: A track is reported late where it must be so improbable that it is false.
+_LATE_P0 = 1e-10
 PEER, EARLY_PEER = "Stone Soup", "Stone Soup, early"
 
 #: More rows of a table, and after which of the summary's.
@@ -93,10 +95,9 @@ def trackers(scenario: Scenario, file: Path, folder: Path) -> dict[str, list[str
         peers[EARLY_PEER] = [*peers[PEER], *(word for change in changes for word in ("--set", change))]
     if scenario.initiation is None and not scenario.hypotheses:
         return peers  # nothing would start a track
-    variants = {"waldnet": str(file)}
-    if any(sensor.kind == "bearing" for sensor in scenario.sensors):
-        variants["waldnet, no bearings"] = str(without_bearings(scenario, file, folder))
-    commands = {name: [waldnet, "replay", path, "--json"] for name, path in variants.items()}
+    commands = {
+        name: [waldnet, "replay", str(path), "--json"] for name, path in variants(scenario, file, folder).items()
+    }
     told = subprocess.run([waldnet, "replay", "--help"], capture_output=True, text=True, check=True).stdout
     if "--centralised" in told:
         commands["waldnet, centralised"] = [*commands["waldnet"], "--centralised"]
@@ -117,17 +118,34 @@ def shorter(file: Path, folder: Path) -> Path:
     return written
 
 
-def without_bearings(scenario: Scenario, file: Path, folder: Path) -> Path:
-    """A scenario like another, but for the sensors that tell no position."""
-    assert scenario.recording is not None
-    ignored = [sensor.name for sensor in scenario.sensors if sensor.kind == "bearing"]
-    head, *sensors = file.read_text(encoding="utf-8").split("[[sensor]]")
-    recording = f"[recording]\nplots = {json.dumps(str(scenario.recording.plots.resolve()))}\nignore = {ignored}\n"
-    head = re.sub(r"\[recording\]\nplots = .*\n", lambda _: recording, head)
-    kept = [sensor for sensor in sensors if 'kind = "bearing"' not in sensor]
-    written = folder / "no-bearings.toml"
-    written.write_text("[[sensor]]".join([head, *kept]), encoding="utf-8")
-    return written
+def variants(scenario: Scenario, file: Path, folder: Path) -> dict[str, Path]:
+    """The scenario, and others like it: without bearings, without clutter maps, and with tracks that are reported late.
+
+    Args:
+        scenario: to track.
+        file: of the scenario.
+        folder: to write the others to.
+    """
+    found, text = {"waldnet": file}, file.read_text(encoding="utf-8")
+
+    def write(name: str, changed: str, ignored: Sequence[str] = ()) -> None:
+        assert scenario.recording is not None
+        plots = json.dumps(str(scenario.recording.plots.resolve()))
+        recording = f"[recording]\nplots = {plots}\nignore = {json.dumps(ignored)}\n"
+        found[f"waldnet, {name}"] = folder / f"{name.replace(' ', '-')}.toml"
+        changed = re.sub(r"\[recording\]\nplots = .*\n", lambda _: recording, changed)
+        found[f"waldnet, {name}"].write_text(changed, encoding="utf-8")
+
+    if scenario.recording is None:
+        return found
+    head, *sensors = text.split("[[sensor]]")
+    if bearings := [sensor.name for sensor in scenario.sensors if sensor.kind == "bearing"]:
+        kept = [sensor for sensor in sensors if 'kind = "bearing"' not in sensor]
+        write("no bearings", "[[sensor]]".join([head, *kept]), bearings)
+    if any(sensor.clutter_map is not None for sensor in scenario.sensors):
+        write("no clutter maps", re.sub(r"^clutter_map = .*\n", "", text, flags=re.MULTILINE))
+    write("late", re.sub(r"^p0 = .*$", f"p0 = {_LATE_P0}", text, flags=re.MULTILINE))
+    return found
 
 
 def track(

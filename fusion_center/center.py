@@ -364,15 +364,12 @@ class Center:
                 break
             rest = {time: group for time, group in state.waiting.items() if time != time_ns}
             state = self._work_in(state._replace(waiting=rest), time_ns, waiting.reports)
-            messages += [
-                *state.history[-1].decisions,
-                self.tracks(state),
-                *self._begun(state, state.history[-1].decisions),
-            ]
-            messages += self._advice(state)
+            decisions, tracks = state.history[-1].decisions, self.tracks(state)
+            told = [*self._begun(state, decisions), *self._advice(state)]
             state, rebase = self._rebase(state)
             state, stops = self._forget(state)
-            messages += [*rebase, *stops]
+            # In lockstep a node goes on once it is told what begins or advised: tracks that end come before.
+            messages += [*decisions, tracks, *stops, *told, *rebase]
         return state, messages
 
     def _forget(self, state: State) -> tuple[State, list[Message]]:

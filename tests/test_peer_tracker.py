@@ -18,7 +18,7 @@ from stonesoup.types.state import GaussianState
 
 from benchmarks.peer_models import detections_of, eyes_of, instant, start_of, x_of
 from benchmarks.peer_tracker import PeerTracker, Settings, changed, run, tuned
-from benchmarks.real_runs import shorter, table, track, without_bearings
+from benchmarks.real_runs import shorter, table, track, variants
 from benchmarks.real_truth import rules_of, times_of, truth_of
 from common.config import Scenario, load_scenario
 from common.errors import ConfigError
@@ -26,6 +26,7 @@ from common.estimation.gaussian import Array
 from common.messages import Scan
 from scenarios.catalogue import find
 from scenarios.truth import Whereabouts
+from sensor_node.sources import all_scans
 from studies.evaluate.evaluation import Rules, judge
 from studies.evaluate.paths import targets_at
 from studies.evaluate.runs import read_run
@@ -172,9 +173,14 @@ def test_what_the_peer_cannot_is_said() -> None:
     assert start_of(network).covar[1, 1] == 25.0
 
 
-def test_the_ferry_without_cameras(tmp_path: Path) -> None:
+def test_the_ferry_in_other_ways(tmp_path: Path) -> None:
     whole = load_scenario(find("autoferry-2-all"))
-    bare = load_scenario(without_bearings(whole, find("autoferry-2-all"), tmp_path))
+    others = {name: load_scenario(path) for name, path in variants(whole, find("autoferry-2-all"), tmp_path).items()}
+    assert others.pop("waldnet") == whole
+    assert [sensor.clutter_map for sensor in others["waldnet, no clutter maps"].sensors] == [None] * 4
+    assert others["waldnet, late"].decision.p0 == 1e-10
+    assert all(len(all_scans(other)) for other in others.values())
+    bare = others["waldnet, no bearings"]
     assert bare.sensor_names == ("radar", "lidar")
     assert bare.recording is not None
     assert bare.recording.ignore == ("infrared", "daylight")

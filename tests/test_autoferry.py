@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from builders import all_same
 
 from common.config import Scenario, load_scenario
 from common.messages import Tracks
@@ -18,6 +19,8 @@ from scenarios.autoferry import measure
 from scenarios.autoferry.convert import SCENARIOS, main
 from scenarios.truth import read_truth
 from sensor_node.sources import all_scans
+from studies.network import run_in_memory
+from studies.record import Record
 from studies.replay import Replay
 
 FOLDER = catalogue.FOLDER / "autoferry"
@@ -175,3 +178,16 @@ def test_in_the_canal_maps_leave_less_than_a_third_of_the_false_tracks() -> None
         held = {track for near in pictures for track, boats in near.items() if any(boats)}
         false.append(len({track for near in pictures for track in near} - held))
     assert false[0] < false[1] / 3
+
+
+def test_four_nodes_on_a_bus_say_what_the_replay_says() -> None:
+    """In lockstep, with all that this scenario has: starts, maps, visibility, bearings, advice."""
+    plot = load_scenario(catalogue.find("autoferry-13-all"))
+    scans = [scan for scan in all_scans(plot) if scan.time_ns <= plot.to_ns(45.0)]
+    replayed = Record(plot)
+    for message in Replay(plot, scans).run():
+        replayed.note(message)
+    live = run_in_memory(plot, scans)
+    assert all_same(live.decisions, replayed.decisions)
+    assert all_same(list(live.pictures.values()), list(replayed.pictures.values()))
+    assert len(live.pictures) > 50

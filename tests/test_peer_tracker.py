@@ -178,7 +178,7 @@ def test_the_ferry_in_other_ways(tmp_path: Path) -> None:
     others = {name: load_scenario(path) for name, path in variants(whole, find("autoferry-2-all"), tmp_path).items()}
     assert others.pop("waldnet") == whole
     assert [sensor.clutter_map for sensor in others["waldnet, no clutter maps"].sensors] == [None] * 4
-    assert others["waldnet, late"].decision.p0 == 1e-10
+    assert [others[f"waldnet, {name}"].decision.p0 for name in ("late", "latest")] == [1e-10, 1e-30]
     assert all(len(all_scans(other)) for other in others.values())
     bare = others["waldnet, no bearings"]
     assert bare.sensor_names == ("radar", "lidar")

@@ -29,6 +29,7 @@ demo: $(VENV)/user.stamp ## four simulated radars, then a recorded ferry: proces
 	@echo "  log_lr.png      log LR of every hypothesis, until it crossed a threshold and after"
 	@echo "  plan.png        sensors, plots, tracks with 95 % ellipses"
 	@echo "  decisions.json  what was decided when;  tracks.jsonl  every track at every time;  logs/  of the processes"
+	@echo "  input/  the scenario and all plots, to replay or to evaluate"
 
 # A file stays with one process, which makes its fixtures once; in order, for by number of tests the longest come last.
 test: $(VENV)/test.stamp ## all tests

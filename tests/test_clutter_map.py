@@ -124,6 +124,17 @@ def test_a_target_that_is_tracked_hardly_counts_and_what_nobody_claims_does() ->
     assert relative(node, [-2000.0, 3000.0]) > 100.0
 
 
+def test_what_a_track_claims_that_stands_still_is_learned_where_targets_move() -> None:
+    still = [{"state": [0.0, 0.0, 0.0, 0.0], "sigma": [100.0, 100.0, 20.0, 20.0]}]
+    learned = []
+    for min_speed in (0.0, 20.0):
+        node = node_of(given(hypothesis=still, target=[], initiation={"speed": 30.0, "min_speed": min_speed}))
+        for k in range(1, 16):
+            seen_at(node, 2.0 * k, [0.0, 0.0])
+        learned.append(relative(node, [0.0, 0.0]))
+    assert learned[1] > 3.0 * learned[0]
+
+
 def test_a_scan_is_judged_by_earlier_ones_and_keeps_its_judgement() -> None:
     plot = given()
     node = node_of(plot)

@@ -168,6 +168,21 @@ def test_where_all_surely_exist_and_none_can_be_missed_too_few_plots_are_no_plot
     assert 0.0 <= left[0] <= 1.0
 
 
+def test_of_tracks_that_are_no_targets_the_plots_are_false() -> None:
+    rng = np.random.default_rng(7)
+    log_p, r = weights(rng, 3, 4)[:, None], np.array([0.9, 0.6, 0.3])
+
+    def false(target: list[float]) -> Array:
+        return joint(np.zeros((3, 1)), log_p, None, 4, r, np.array(target)).false
+
+    unclaimed = joint(np.zeros((3, 1)), log_p, None, 4, r).unclaimed
+    np.testing.assert_allclose(false([1.0, 1.0, 1.0]), unclaimed, atol=1e-12)
+    np.testing.assert_allclose(false([0.0, 0.0, 0.0]), 1.0)
+    # Claims add up: what each track takes of the plots, it takes as far as it is a target.
+    each = [1.0 - false(row.tolist()) for row in np.eye(3)]
+    np.testing.assert_allclose(1.0 - false([0.5, 0.2, 1.0]), 0.5 * each[0] + 0.2 * each[1] + each[2], atol=1e-12)
+
+
 def test_twins_that_cannot_be_missed_share_two_plots_evenly() -> None:
     log_p = np.array([[-np.inf, 5.0, 5.0], [-np.inf, 5.0, 5.0]])
     log_nu, left = of_one_component(log_p, np.ones(2))

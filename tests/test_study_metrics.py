@@ -169,7 +169,7 @@ def test_a_sensor_that_saw_the_impossible_has_said_all_it_can() -> None:
     """Once log LR is -inf, its steps are no numbers; the other sensor goes on."""
     local = np.array([np.transpose([[-np.inf] * 4, [1.0, 5.0, 5.0, 10.0]])])
     fused = fuse_decisions(local, LIMITS)
-    a, b = LIMITS
+    a, b = LIMITS.log_a, LIMITS.log_b
     np.testing.assert_allclose(fused, [[a, a + b, a + b, a + 2 * b]])
 
 

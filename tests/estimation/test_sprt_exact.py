@@ -51,7 +51,9 @@ def deviation(sample: Array, expected: float) -> float:
 def test_figures_of_the_integral_equation(d: float, alpha: float, true_alpha: float, length: float) -> None:
     """To the digits given; twice the nodes change nothing; and h1 is h0 mirrored."""
     limits = thresholds(alpha, 1.0 - alpha)
-    h0, finer, h1 = (leave(*limits, d, h1, nodes) for h1, nodes in ((False, 200), (False, 400), (True, 400)))
+    h0, finer, h1 = (
+        leave(limits.log_a, limits.log_b, d, h1, nodes) for h1, nodes in ((False, 200), (False, 400), (True, 400))
+    )
     assert f"{h0.above:.3g}" == f"{true_alpha:.3g}"
     assert f"{h0.steps:.4g}" == f"{length:.4g}"
     assert h0 == pytest.approx(finer, rel=1e-9)
@@ -70,7 +72,7 @@ def test_far_thresholds_are_passed_as_renewal_theory_says(d: float) -> None:
 def test_the_test_has_the_exact_error_rates_and_lengths(d: float, alpha: float) -> None:
     """100,000 tests each; every mean within 4 of its standard errors, which are far smaller than Wald's slack."""
     limits = thresholds(alpha, 1.0 - alpha)
-    exact = leave(*limits, d, under_h1=False)
+    exact = leave(limits.log_a, limits.log_b, d, under_h1=False)
     rng = np.random.default_rng([int(100 * d), int(1000 * alpha)])
     h0, h1 = carried_out(0.0, d, limits, RUNS, rng), carried_out(d, d, limits, RUNS, rng)
     for errors in (h0.accepted, 1.0 - h1.accepted):
@@ -85,7 +87,10 @@ def test_the_test_has_the_exact_error_rates_and_lengths(d: float, alpha: float) 
 def test_walds_inequalities(alpha: float, beta: float, d: float) -> None:
     """alpha' <= alpha / (1 - beta), beta' <= beta / (1 - alpha), alpha' + beta' <= alpha + beta."""
     limits = thresholds(alpha, 1.0 - beta)
-    false_alarm, miss = leave(*limits, d, under_h1=False).above, 1.0 - leave(*limits, d, under_h1=True).above
+    false_alarm, miss = (
+        leave(limits.log_a, limits.log_b, d, under_h1=False).above,
+        1.0 - leave(limits.log_a, limits.log_b, d, under_h1=True).above,
+    )
     assert 0.0 < false_alarm < alpha / (1.0 - beta)
     assert 0.0 < miss < beta / (1.0 - alpha)
     assert false_alarm + miss < alpha + beta

@@ -15,7 +15,7 @@ import numpy as np
 
 from common.config import Scenario
 from common.estimation.batch import take
-from common.estimation.gaussian import Array, Gaussian
+from common.estimation.gaussian import Gaussian
 from common.estimation.sprt import DELETED
 from common.fusion_config import FusionConfig
 from common.messages import (
@@ -24,7 +24,6 @@ from common.messages import (
     Begin,
     Clock,
     Decision,
-    IntArray,
     Join,
     Message,
     Picked,
@@ -37,7 +36,7 @@ from common.messages import (
 from common.quantities import NS_PER_S
 from fusion_center.factors import Fuser
 from fusion_center.initiation import Initiation, Unclaimed
-from fusion_center.picture import Picture, shown
+from fusion_center.picture import Picture, corrections, fused, shown
 from fusion_center.selected import SelectedFuser
 from fusion_center.state import (
     AnyExpected,
@@ -268,7 +267,7 @@ class Center:
             state = self._work_in(state, time_ns, groups[time_ns], begun)
             pictures += [self.tracks(state), *self._advice(state)]
         after = [decision for checkpoint in state.history[at:] for decision in checkpoint.decisions]
-        return state, [*_corrections(before, after), *pictures, *self._begun(state, after)]
+        return state, [*corrections(before, after), *pictures, *self._begun(state, after)]
 
     def _work_in(
         self, state: State, time_ns: int, reports: Mapping[int, AnyHeard], begun: Begun | None = None
@@ -418,14 +417,14 @@ class Center:
             return []
         at = bisect_right(state.history, state.time_ns - self._delay_ns, key=lambda checkpoint: checkpoint.time_ns)
         time_ns, picture = (state.history[at - 1].time_ns, state.history[at - 1].picture) if at else (0, state.base)
-        return [Advice(state.time_ns, time_ns, *_fused(picture, time_ns))]
+        return [Advice(state.time_ns, time_ns, *fused(picture, time_ns))]
 
     def _rebase(self, state: State) -> tuple[State, list[Message]]:
         """Let all factors begin anew from the fused tracks once the delay is over, where wanted (theory.md §3)."""
         if self.fusion.feedback != "reset":
             return state, []
         time_ns = state.time_ns
-        rebase = Rebase(self._next_epoch(state), time_ns + self._delay_ns, time_ns, *_fused(state.picture, time_ns))
+        rebase = Rebase(self._next_epoch(state), time_ns + self._delay_ns, time_ns, *fused(state.picture, time_ns))
         return state._replace(told=(*state.told, Told(rebase))), [rebase]
 
     def tracks(self, state: State) -> Tracks:
@@ -446,18 +445,6 @@ def given(scenario: Scenario, fuser: AnyFuser) -> Picture:
     )
 
 
-def _fused(picture: Picture, time_ns: int) -> tuple[IntArray, Array, Array]:
-    """Ids and fused densities of the tracks that live at the time of a picture."""
-    live = (picture.starts_ns <= time_ns) & (picture.status != DELETED)
-    return picture.ids[live], picture.fused_x[live], picture.fused_P[live]
-
-
 def _unclaimed(reports: Mapping[int, AnyHeard]) -> list[Unclaimed]:
     """The plots of one measurement time that no track claims, by sensor."""
     return [Unclaimed.of(number, reports[number].report) for number in sorted(reports)]
-
-
-def _corrections(before: list[Decision], after: list[Decision]) -> list[Message]:
-    """Decisions that a late report brought, undid, or changed in their numbers."""
-    withdrawn = [decision._replace(kind="withdrawn") for decision in before if decision not in after]
-    return [*withdrawn, *(decision for decision in after if decision not in before)]

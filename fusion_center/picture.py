@@ -8,7 +8,7 @@ import numpy as np
 
 from common.estimation.batch import take
 from common.estimation.gaussian import Array, BoolArray
-from common.estimation.sprt import StatusArray, Thresholds, decide
+from common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
 from common.messages import Decision, IntArray, Tracks
 
 
@@ -90,6 +90,18 @@ def decided(picture: Picture, limits: Thresholds | None) -> tuple[Picture, list[
         for row in np.nonzero(verdict.status != picture.status)[0]
     ]
     return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
+
+
+def corrections(before: list[Decision], after: list[Decision]) -> list[Decision]:
+    """Decisions that a late report brought, undid, or changed in their numbers."""
+    withdrawn = [decision._replace(kind="withdrawn") for decision in before if decision not in after]
+    return [*withdrawn, *(decision for decision in after if decision not in before)]
+
+
+def fused(picture: Picture, time_ns: int) -> tuple[IntArray, Array, Array]:
+    """Ids and fused densities of the tracks that live at the time of a picture."""
+    live = (picture.starts_ns <= time_ns) & (picture.status != DELETED)
+    return picture.ids[live], picture.fused_x[live], picture.fused_P[live]
 
 
 def shown(picture: Picture, time_ns: int, names: tuple[str, ...]) -> Tracks:

@@ -17,6 +17,9 @@ from sensor_node.sources import schedule_of
 from sensor_node.state import Schedule
 from sensor_node.state import State as NodeState
 from sensor_node.tracker import LocalTracker
+from studies.network import run_in_memory
+from studies.record import Record
+from studies.replay import Replay
 
 BOX = {"shape": "box", "center": [0.0, 0.0], "size": [20_000.0, 20_000.0]}
 
@@ -71,6 +74,18 @@ def same(first: Sequence[Any], second: Sequence[Any]) -> bool:
 def all_same(first: Sequence[Sequence[Any]], second: Sequence[Sequence[Any]]) -> bool:
     """Whether two lists of messages are equal."""
     return len(first) == len(second) and all(same(one, other) for one, other in zip(first, second, strict=True))
+
+
+def live_as_replayed(plot: Scenario, scans: Sequence[Scan]) -> Record:
+    """What nodes and center say to each other on a bus in lockstep, which must be what the replay says."""
+    replayed = Record(plot)
+    for message in Replay(plot, scans).run():
+        replayed.note(message)
+    live = run_in_memory(plot, scans)
+    assert all_same(live.decisions, replayed.decisions)
+    assert live.pictures.keys() == replayed.pictures.keys()
+    assert all_same(list(live.pictures.values()), list(replayed.pictures.values()))
+    return live
 
 
 def only(kind: type[Any], messages: Iterable[Message]) -> list[Any]:

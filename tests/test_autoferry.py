@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import all_same
+from builders import live_as_replayed
 
 from common.config import Scenario, load_scenario
 from common.messages import Tracks
@@ -19,8 +19,6 @@ from scenarios.autoferry import measure
 from scenarios.autoferry.convert import SCENARIOS, main
 from scenarios.truth import read_truth
 from sensor_node.sources import all_scans
-from studies.network import run_in_memory
-from studies.record import Record
 from studies.replay import Replay
 
 FOLDER = catalogue.FOLDER / "autoferry"
@@ -184,10 +182,5 @@ def test_four_nodes_on_a_bus_say_what_the_replay_says() -> None:
     """In lockstep, with all that this scenario has: starts, maps, visibility, bearings, advice."""
     plot = load_scenario(catalogue.find("autoferry-13-all"))
     scans = [scan for scan in all_scans(plot) if scan.time_ns <= plot.to_ns(45.0)]
-    replayed = Record(plot)
-    for message in Replay(plot, scans).run():
-        replayed.note(message)
-    live = run_in_memory(plot, scans)
-    assert all_same(live.decisions, replayed.decisions)
-    assert all_same(list(live.pictures.values()), list(replayed.pictures.values()))
+    live = live_as_replayed(plot, scans)
     assert len(live.pictures) > 50

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import Node, Stage, all_same, scenario, sensor_table
+from builders import Node, Stage, live_as_replayed, scenario, sensor_table
 
 from common.config import Scenario, load_scenario
 from common.errors import ConfigError
@@ -15,9 +15,7 @@ from common.estimation.clutter_map import ClutterMap, log_relative
 from common.estimation.gaussian import Array
 from common.messages import Report, Scan, Tracks
 from scenarios.world import simulate, simulate_all
-from studies.network import run_in_memory
 from studies.plan import Order, check
-from studies.record import Record
 from studies.replay import Replay
 
 MAP = {"cell": 100.0, "memory": 120.0, "shape": 3e-3, "start_below": 10.0}
@@ -79,12 +77,7 @@ def test_live_and_replayed_networks_with_maps_say_the_same_in_lockstep() -> None
     )
     plot = harbour(MAP, camera, simulation={"duration": 20.0}, fusion={"feedback": "advice"})
     scans = simulate_all(plot, 5)
-    replayed = Record(plot)
-    for message in Replay(plot, scans).run():
-        replayed.note(message)
-    live = run_in_memory(plot, scans)
-    assert all_same(live.decisions, replayed.decisions)
-    assert all_same(list(live.pictures.values()), list(replayed.pictures.values()))
+    live_as_replayed(plot, scans)
 
 
 def given(**tables: Any) -> Scenario:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import Node, Stage, all_same, only, scenario, sensor_table
+from builders import Node, Stage, live_as_replayed, only, scenario, sensor_table
 
 from common.config import Scenario
 from common.estimation.gaussian import Gaussian
@@ -14,8 +14,6 @@ from common.messages import NEVER, Begin, Decision, Join, Message, Report, Scan,
 from fusion_center.initiation import Initiation, Unclaimed
 from fusion_center.picture import Picture
 from scenarios.world import simulate_all
-from studies.network import run_in_memory
-from studies.record import Record
 from studies.replay import Replay
 
 NONE = np.empty(0, np.int64)
@@ -179,13 +177,7 @@ def test_a_network_with_a_bearing_sensor_finds_its_targets_from_two_plots() -> N
 def test_live_and_replayed_networks_say_the_same_in_lockstep() -> None:
     plot = two_boats()
     scans = simulate_all(plot, 5)
-    replayed = Record(plot)
-    for message in Replay(plot, scans).run():
-        replayed.note(message)
-    live = run_in_memory(plot, scans)
-    assert all_same(live.decisions, replayed.decisions)
-    assert live.pictures.keys() == replayed.pictures.keys()
-    assert all_same(list(live.pictures.values()), list(replayed.pictures.values()))
+    live_as_replayed(plot, scans)
 
 
 class Network:

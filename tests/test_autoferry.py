@@ -80,11 +80,12 @@ def test_a_wrong_measurement_is_named_and_nothing_written(tmp_path: Path, capsys
     assert not (tmp_path / "scenario7.jsonl").exists()
 
 
-def test_bearings_come_in_three_forms(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("number", "name"), [(3, "daylight"), (4, "infrared")])
+def test_bearings_come_in_three_forms(tmp_path: Path, number: int, name: str) -> None:
     """A list, a bare number for one bearing, and an empty list for none: a miss, not a gap."""
-    scans = convert(dataset(tmp_path, [0.4212120053, -2.1709064241], -2.2054613959, [], sensor=4))
+    scans = convert(dataset(tmp_path, [0.4212120053, -2.1709064241], -2.2054613959, [], sensor=number))
     assert [scan["plots"] for scan in scans] == [[[0.42121], [-2.17091]], [[-2.20546]], []]
-    assert {scan["sensor"] for scan in scans} == {"daylight"}
+    assert {scan["sensor"] for scan in scans} == {name}
 
 
 @pytest.mark.parametrize("measurement", [121.0, [0.1, "0.2"], [[0.1], [0.2]], None])
@@ -111,12 +112,12 @@ def test_a_boat_is_measured_where_it_is(tmp_path: Path) -> None:
     truth = [{"target": n, "time": t, "position": place} for n, place in SQUARE.items() for t in (0.0, 3.0)]
     bearings = [[[1.58], [0.8]], [[1.60], [-3.0]], []]
     scans = [
-        {"sensor": "daylight", "time": 1.0 + k, "position": [10.0, 20.0], "plots": plots}
+        {"sensor": "infrared", "time": 1.0 + k, "position": [10.0, 20.0], "plots": plots}
         for k, plots in enumerate(bearings)
     ]
     for name, lines in (("scenario7-truth.jsonl", truth), ("scenario7.jsonl", scans)):
         (tmp_path / name).write_text("".join(json.dumps(line) + "\n" for line in lines))
-    looks = measure.compare(tmp_path, 7, "daylight")
+    looks = measure.compare(tmp_path, 7, "infrared")
     assert [look.false_plots for look in looks] == [1, 1, 0]
     north, east = zip(*(look.boats for look in looks), strict=True)
     assert [boat.error for boat in north] == [None] * 3
@@ -128,7 +129,7 @@ def test_a_boat_is_measured_where_it_is(tmp_path: Path) -> None:
 
 def test_bearings_point_at_the_boats() -> None:
     """Mirrored or turned, they would find the boats by chance only."""
-    found = [boat.error for look in measure.compare(FOLDER, 5, "daylight") for boat in look.boats if boat.number == 2]
+    found = [boat.error for look in measure.compare(FOLDER, 5, "infrared") for boat in look.boats if boat.number == 2]
     errors = [float(error[0]) for error in found if error is not None]
     assert len(errors) > 0.8 * len(found)
     assert abs(sum(errors) / len(errors)) < 0.02
@@ -137,7 +138,7 @@ def test_bearings_point_at_the_boats() -> None:
 @pytest.mark.parametrize("number", SCENARIOS)
 def test_all_four_sensors_are_there(number: int) -> None:
     loaded = load_scenario(catalogue.find(f"autoferry-{number}-all"))
-    assert loaded.sensor_names == ("radar", "lidar", "infrared", "daylight")
+    assert loaded.sensor_names == ("radar", "lidar", "daylight", "infrared")
     assert {scan.sensor for scan in all_scans(loaded)} == set(loaded.sensor_names)
 
 

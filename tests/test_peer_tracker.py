@@ -183,7 +183,7 @@ def test_the_ferry_in_other_ways(tmp_path: Path) -> None:
     bare = others["waldnet, no bearings"]
     assert bare.sensor_names == ("radar", "lidar")
     assert bare.recording is not None
-    assert bare.recording.ignore == ("infrared", "daylight")
+    assert bare.recording.ignore == ("daylight", "infrared")
 
 
 def test_simulated_scenarios_are_shortened(tmp_path: Path) -> None:

@@ -218,7 +218,7 @@ def test_the_recorded_ferry(name: str, content: dict[str, tuple[int, int]], time
     fov = {"shape": "disc", "radius": 500.0}
     sensors = [sensor_table(sensor, position=None, field_of_view=fov, sigma=[5.0, 5.0]) for sensor in content]
     path = catalogue.FOLDER / "autoferry" / name
-    recording = {"plots": path, "ignore": ["infrared", "daylight"]}
+    recording = {"plots": path, "ignore": ["daylight", "infrared"]}
     plot = scenario(*sensors, epoch="2021-05-04T07:54:51Z", recording=recording)
     scans = read_plots(path, plot)
     seen = {sensor: [scan for scan in scans if scan.sensor == sensor] for sensor in content}

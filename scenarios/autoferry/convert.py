@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import NamedTuple, TypeGuard, TypeVar
 
 SCENARIOS = (2, 3, 5, 13, 16)
-SENSORS: Mapping[int, str] = {1: "lidar", 2: "radar", 3: "infrared", 4: "daylight"}
-CAMERAS = ("infrared", "daylight")
+SENSORS: Mapping[int, str] = {1: "lidar", 2: "radar", 3: "daylight", 4: "infrared"}
+CAMERAS = ("daylight", "infrared")
 
 Vector = tuple[float, float]
 T = TypeVar("T")

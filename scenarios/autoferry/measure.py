@@ -23,7 +23,7 @@ from scenarios.autoferry.convert import CAMERAS, SCENARIOS
 from scenarios.autoferry.persistence import LAG_S, Watch, correlation, fitted, watches
 
 #: Up to where a boat is looked for [m].
-REACH = {"radar": 500.0, "lidar": 125.0, "infrared": 300.0, "daylight": 300.0}
+REACH = {"radar": 500.0, "lidar": 125.0, "daylight": 300.0, "infrared": 300.0}
 #: How far from a boat a plot may be [m], a bearing [rad].
 NEAR_M, NEAR_RAD = 25.0, 0.1
 #: Two boats are in one line for whoever sees less than this between them [rad].

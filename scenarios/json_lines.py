@@ -1,8 +1,13 @@
-"""Reading JSON Lines: one object a line, blank lines skipped; what is wrong is said with file and line."""
+"""Reading JSON Lines: one object a line, blank lines skipped; what is wrong is said with file and line.
+
+A file may be compressed with gzip, whatever its name is, and may begin with a byte order mark.
+"""
 
 from __future__ import annotations
 
+import gzip
 import json
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
@@ -14,6 +19,9 @@ T = TypeVar("T")
 
 #: No number is larger; NaN and infinities are none.
 _LARGEST = 1e15
+#: So many faults of a file are listed, the others counted.
+_LISTED = 20
+_GZIP = b"\x1f\x8b"
 
 
 def read_lines(
@@ -35,23 +43,42 @@ def read_lines(
         optional: keys that an object may have too; None for any.
 
     Yields:
-        what was parsed, line by line.
+        what was parsed, line by line, without the lines that are wrong.
 
     Raises:
-        WaldnetError: a ``failure`` naming file, line and reason.
+        WaldnetError: after the last line: a ``failure`` naming file, line and reason of every fault, up to a bound.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise failure(f"{path}: cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise failure(f"{path}: is no UTF-8 text: {error.reason} at byte {error.start}") from None
-    for number, line in enumerate(text.splitlines(), start=1):
+    faults = 0
+    listed: list[str] = []
+    for number, line in enumerate(_text(path, failure).splitlines(), start=1):
         if line.strip():
             try:
-                yield parse(_object(line, what, keys, optional), number)
+                parsed = parse(_object(line, what, keys, optional), number)
             except ValueError as error:
-                raise failure(f"{path}:{number}: {error}") from None
+                faults += 1
+                if faults <= _LISTED:
+                    listed.append(f"{path}:{number}: {error}")
+            else:
+                yield parsed
+    if faults > _LISTED:
+        listed.append(f"{path}: {faults - _LISTED} more lines are wrong, {faults} in all")
+    if faults:
+        raise failure("\n".join(listed))
+
+
+def _text(path: Path, failure: type[WaldnetError]) -> str:
+    """The text of a file, decompressed, without a byte order mark."""
+    try:
+        content = path.read_bytes()
+        if content.startswith(_GZIP):
+            content = gzip.decompress(content)
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise failure(f"{path}: is no UTF-8 text: {error.reason} at byte {error.start}") from None
+    except (gzip.BadGzipFile, EOFError, zlib.error) as error:
+        raise failure(f"{path}: is damaged, gzip cannot decompress it: {error}") from None
+    except OSError as error:
+        raise failure(f"{path}: cannot be read: {error.strerror}") from None
 
 
 def _object(line: str, what: str, keys: Sequence[str], optional: Sequence[str] | None) -> dict[str, Any]:

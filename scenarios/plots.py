@@ -38,7 +38,7 @@ def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
         the scans, by time; those of one time in the order of the scenario's sensors.
 
     Raises:
-        PlotsError: naming file, line and reason.
+        PlotsError: naming file, line and reason of every fault, up to a bound.
     """
     first_line: dict[tuple[str, int], int] = {}
 

@@ -702,3 +702,9 @@ def test_where_a_sensor_stands() -> None:
 def test_a_scenario_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="frozen"):
         scenario().name = "other"  # type: ignore[misc]
+
+
+def test_a_byte_order_mark_before_a_scenario(tmp_path: Path) -> None:
+    shipped = catalogue.find("no-target")
+    (tmp_path / "marked.toml").write_bytes(b"\xef\xbb\xbf" + shipped.read_bytes())
+    assert load_scenario(tmp_path / "marked.toml") == load_scenario(shipped)

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
+import gzip
 import io
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -205,6 +207,40 @@ def test_a_file_that_is_no_text(tmp_path: Path) -> None:
     with pytest.raises(PlotsError) as caught:
         read_plots(path, PLOT)
     assert str(caught.value) == f"{path}: is no UTF-8 text: invalid continuation byte at byte 12"
+
+
+def test_all_faults_are_listed_up_to_a_bound(tmp_path: Path) -> None:
+    lines = [LINE, {**LINE, "sensor": "c"}, "{", {**LINE, "time": 3.0}, LINE]
+    listed = refusal(tmp_path, *lines).replace(f"{tmp_path}/", "").splitlines()
+    assert [fault.split(": ")[0] for fault in listed] == ["plots.jsonl:2", "plots.jsonl:3", "plots.jsonl:5"]
+    assert listed[-1] == "plots.jsonl:5: a has a scan at 2.0 s already, line 1"
+    many = refusal(tmp_path, *["{"] * 50).splitlines()
+    assert len(many) == 21
+    assert many[-1].endswith("plots.jsonl: 30 more lines are wrong, 50 in all")
+
+
+PACKED = {
+    "as it is": lambda content: content,
+    "byte order mark": lambda content: b"\xef\xbb\xbf" + content,
+    "gzip": gzip.compress,
+    "gzip of a byte order mark": lambda content: gzip.compress(b"\xef\xbb\xbf" + content),
+    "two gzip members": lambda content: gzip.compress(content[:9]) + gzip.compress(content[9:]),
+}
+
+
+@pytest.mark.parametrize("pack", PACKED.values(), ids=PACKED)
+@pytest.mark.parametrize("name", ["plots.jsonl", "plots.jsonl.gz"])
+def test_a_byte_order_mark_and_gzip_are_read(tmp_path: Path, name: str, pack: Callable[[bytes], bytes]) -> None:
+    (tmp_path / name).write_bytes(pack(written(simulate_all(PLOT, 3)).encode()))
+    assert all_same(read_plots(tmp_path / name, PLOT), simulate_all(PLOT, 3))
+
+
+@pytest.mark.parametrize("harm", [lambda b: b[:-12], lambda b: b[:12] + b"\0" * 9 + b[21:]], ids=["short", "broken"])
+def test_a_damaged_gzip_file_is_named(tmp_path: Path, harm: Callable[[bytes], bytes]) -> None:
+    path = tmp_path / "plots.jsonl.gz"
+    path.write_bytes(harm(gzip.compress(written(simulate_all(PLOT, 3)).encode())))
+    with pytest.raises(PlotsError, match=r"plots.jsonl.gz: is damaged, gzip cannot decompress it: "):
+        read_plots(path, PLOT)
 
 
 RECORDED = [

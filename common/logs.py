@@ -35,13 +35,20 @@ class Complaints:
     def __init__(self, log: structlog.typing.FilteringBoundLogger) -> None:
         """Log to ``log``."""
         self._log = log
-        self._logged_at: dict[str, float] = {}
+        self._logged_at: dict[tuple[str, ...], float] = {}
         self.counts: Counter[str] = Counter()
 
-    def add(self, kind: str, why: str, count: int = 1) -> None:
-        """Count ``count`` events of a kind, and say why unless that was said within the last second."""
+    def add(self, kind: str, why: str, count: int = 1, **about: str) -> None:
+        """Count ``count`` events of a kind, and say why unless that was said within the last second.
+
+        Args:
+            kind: of event.
+            why: it happened.
+            count: of events.
+            about: further fields of the line, such as the sensor; a kind is said once a second for each of them.
+        """
         self.counts[kind] += count
-        now = time.monotonic()
-        if now - self._logged_at.get(kind, -1.0) >= 1.0:
-            self._logged_at[kind] = now
-            self._log.warning(kind, why=why, count=self.counts[kind])
+        now, said = time.monotonic(), (kind, *about.values())
+        if now - self._logged_at.get(said, -1.0) >= 1.0:
+            self._logged_at[said] = now
+            self._log.warning(kind, why=why, count=self.counts[kind], **about)

@@ -37,6 +37,7 @@ from common.quantities import NS_PER_S
 from fusion_center.factors import Fuser
 from fusion_center.initiation import Initiation, Unclaimed
 from fusion_center.picture import Picture, corrections, fused, shown
+from fusion_center.refusal import Refusal
 from fusion_center.selected import SelectedFuser
 from fusion_center.state import (
     AnyExpected,
@@ -129,15 +130,15 @@ class Center:
         """
         messages: list[Message] = []
         match event:
-            case Join() if event.sensor in self.names and event.digest == self.digest:
+            case Join() if (refusal := self._other_network(event)) is not None:
+                state = state.refuse(event.sensor, refusal)
+            case Join():
                 state, messages = self._join(state, event)
             case Presence() if event.sensor in self.names:
                 number = self.names.index(event.sensor)
                 state = state.with_member(number, state.members[number]._replace(alive=event.alive))
-            case Report() | Picked() if (heard := self._fitting(state, event, now_ns)) is not None:
-                state, messages = self._accept(state, heard, now_ns)
-            case Report() | Picked() | Join():
-                state = state.counted("refused")
+            case Report() | Picked():
+                state, messages = self._receive(state, event, now_ns)
             case _:
                 pass
         state, clock = self._begin(state, now_ns)
@@ -209,20 +210,49 @@ class Center:
         backup = take(self.fuser.backup(picture, number), live)
         return Start(self.names[number], epoch, picture.ids[live], *backup, next_id=state.next_id)
 
-    def _fitting(self, state: State, report: Report | Picked, now_ns: int) -> AnyHeard | None:
-        """A report, if it comes from a sensor of this network and can be computed with."""
+    def _other_network(self, join: Join) -> Refusal | None:
+        """Why a sensor cannot join, if it cannot."""
+        if join.sensor not in self.names:
+            return "unknown sensor"
+        return "another scenario" if join.digest != self.digest else None
+
+    def _receive(self, state: State, report: Report | Picked, now_ns: int) -> tuple[State, list[Message]]:
+        """Take in a report, or count why not.
+
+        A report of the right sensor and epoch always moves on what is still to be expected of its sensor: if it cannot
+        be computed with, its scan is a silent one and nobody waits for it.
+        """
+        refusal = self._misplaced(state, report, now_ns)
+        if refusal is not None:
+            return state.refuse(report.sensor, refusal), []
+        number = self.names.index(report.sensor)
+        member = state.members[number]
+        # It does not show that its sensor is there: the end of a token may overtake the last reports.
+        state = state.with_member(number, member._replace(next_ns=max(member.next_ns, report.next_ns)))
+        heard = self._fitting(report, number)
+        if isinstance(heard, str):
+            return state.refuse(report.sensor, heard), []
+        return self._accept(state, heard, now_ns)
+
+    def _misplaced(self, state: State, report: Report | Picked, now_ns: int) -> Refusal | None:
+        """Why a report is not the next one of a sensor of this network, if it is not; its content does not matter."""
         if report.sensor not in self.names:
-            return None
+            return "unknown sensor"
         member = state.members[self.names.index(report.sensor)]
+        if not member.joined:
+            return "not joined"
         to_follow = (told.rebase for told in state.told if told.rebase.epoch > member.lineage)
         follows = any(report.epoch == rebase.epoch and report.time_ns > rebase.after_ns for rebase in to_follow)
-        if not member.joined or not (report.epoch == member.epoch or follows) or report.next_ns <= report.time_ns:
-            return None
-        if self._ahead(state.clock, report.time_ns, now_ns):
-            return None
-        if self.initiation and not self.initiation.fits(report, self.names.index(report.sensor)):
-            return None
-        return self.fuser.heard(report)
+        if not (report.epoch == member.epoch or follows):
+            return "older epoch" if report.epoch <= max(member.epoch, state.lineage) else "epoch not in force"
+        if report.next_ns <= report.time_ns:
+            return "next scan not after this one"
+        return "time too far ahead" if self._ahead(state.clock, report.time_ns, now_ns) else None
+
+    def _fitting(self, report: Report | Picked, number: int) -> AnyHeard | Refusal:
+        """A report taken apart, or why it cannot be computed with."""
+        fault = self.initiation.fault(report, number) if self.initiation else None
+        return self.fuser.heard(report) if fault is None else fault
 
     def _ahead(self, clock: Clock | None, time_ns: int, now_ns: int) -> bool:
         """Whether a time lies farther in the future than the window: one wrong clock must not make all others late."""
@@ -234,10 +264,7 @@ class Center:
     def _accept(self, state: State, heard: AnyHeard, now_ns: int) -> tuple[State, list[Message]]:
         report = heard.report
         number = self.names.index(report.sensor)
-        member = state.members[number]
         heard = heard._replace(lineage=self._lineage(state, number, report))
-        # It does not show that its sensor is there: the end of a token may overtake the last reports.
-        state = state.with_member(number, member._replace(next_ns=max(member.next_ns, report.next_ns)))
         if report.time_ns <= state.time_ns:
             return self._late(state, number, heard)
         waiting = state.waiting.get(report.time_ns, Waiting({}, now_ns))

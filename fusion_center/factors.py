@@ -21,6 +21,7 @@ from common.estimation.sprt import DELETED, TENTATIVE, Thresholds
 from common.messages import Decision, IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
 from fusion_center.picture import Backup, Picture, common, decided
+from fusion_center.refusal import Refusal
 
 #: No position or speed in m, m/s is larger, and no standard deviation smaller than its inverse.
 _LARGEST = 1e15
@@ -173,18 +174,24 @@ class Fuser:
             network_P=np.empty((0, n_sensors if self.globalised else 0, n, n)),
         )
 
-    def heard(self, report: Report | Picked) -> Heard | None:
-        """A report taken apart, if it can be computed with."""
-        if not isinstance(report, Report) or report.x.shape[-1] != self.motion.n or (report.terms > self.terms).any():
-            return None
+    def heard(self, report: Report | Picked) -> Heard | Refusal:
+        """A report taken apart, or why it cannot be computed with."""
+        if not isinstance(report, Report):
+            return "another fusion mode"
+        if report.x.shape[-1] != self.motion.n:
+            return "wrong dimensions"
+        if (report.terms > self.terms).any():
+            return "too many terms"
         # Positive definite, and far from where squares overflow.
         variances = report.P.diagonal(axis1=-2, axis2=-1)
+        if (variances <= 0.0).any():
+            return "covariance not positive definite"
         if (np.abs(report.x) > _LARGEST).any() or (variances > _LARGEST**2).any() or (variances < _LARGEST**-2).any():
-            return None
+            return "numbers out of range"
         try:
             return Heard.of(report)
         except np.linalg.LinAlgError:
-            return None
+            return "covariance not positive definite"
 
     def backup(self, picture: Picture, number: int) -> Backup:
         """What a sensor that joins goes on from: its last factor where it reported one, else the prior.

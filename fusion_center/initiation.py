@@ -20,6 +20,7 @@ from common.initiation_config import InitiationConfig
 from common.messages import Decision, IntArray, Picked, Report
 from common.quantities import NS_PER_S
 from fusion_center.picture import Picture
+from fusion_center.refusal import Refusal
 
 #: No plot or place is farther [m].
 _LARGEST = 1e9
@@ -77,14 +78,16 @@ class Initiation:
         motion = scenario.motion.build()
         return cls(scenario.initiation, motion, tuple(sensor.build(motion) for sensor in scenario.sensors))
 
-    def fits(self, report: Report | Picked, number: int) -> bool:
-        """Whether the unclaimed plots of a report are such as its sensor gives, and tell of positions."""
+    def fault(self, report: Report | Picked, number: int) -> Refusal | None:
+        """Why the unclaimed plots of a report are not such as its sensor gives, or tell of no positions; None: fine."""
         z, stand, measurement = report.unclaimed, report.position, self.sensors[number].measurement
         if not len(z):
-            return True
-        size = measurement.m, self.motion.dimensions
+            return None
+        d = self.motion.dimensions
+        if (z.shape[1], len(stand)) != (measurement.m, d) or measurement.m < d:
+            return "unclaimed plots of another sensor"
         near = (np.abs(z) < _LARGEST).all() and (np.abs(stand) < _LARGEST).all()
-        return (z.shape[1], len(stand)) == size and measurement.m >= self.motion.dimensions and bool(near)
+        return None if near else "unclaimed plots out of range"
 
     def seeds(self, picture: Picture, now: Sequence[Unclaimed], before: Sequence[Unclaimed]) -> Gaussian:
         """What starts at a measurement time.

@@ -20,6 +20,7 @@ from common.local_filter import SUREST, LocalFilter
 from common.messages import Decision, IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
 from fusion_center.picture import Backup, Picture, common, decided
+from fusion_center.refusal import Refusal
 
 
 class HeardPlots(NamedTuple):
@@ -138,14 +139,14 @@ class SelectedFuser:
             network_P=np.empty((tracks, 0, *priors.P.shape[1:])),
         )
 
-    def heard(self, report: Report | Picked) -> HeardPlots | None:
-        """A report laid out, if it can be computed with."""
+    def heard(self, report: Report | Picked) -> HeardPlots | Refusal:
+        """A report laid out, or why it cannot be computed with."""
         if not isinstance(report, Picked):
-            return None
+            return "another fusion mode"
         config, sensor = next(entry for entry in self.sensors if entry[0].name == report.sensor)
         stand = config.stand(self.filter.motion.dimensions)
         if report.z.shape[-1] != sensor.measurement.m or report.position.shape != stand.shape:
-            return None
+            return "wrong dimensions"
         valid = np.arange(int(report.plots.max(initial=0))) < report.plots[:, None]
         z, number = np.zeros((*valid.shape, report.z.shape[-1])), np.zeros(valid.shape, np.intp)
         z[valid], number[valid] = report.z[report.which], report.which

@@ -15,7 +15,8 @@ from common.logs import Complaints
 from common.messages import NEVER, Decision, Join, Keys, Message, Picked, Report, Tracks, sensor_of
 from common.transport import Bus, Publisher
 from fusion_center.center import Center
-from fusion_center.state import Event, Presence, Tick
+from fusion_center.refusal import by_sensor
+from fusion_center.state import Event, Presence, State, Tick
 
 #: How long a finished center stays for nodes that have not heard of the end yet.
 _LINGER_NS = 2_000_000_000
@@ -61,7 +62,12 @@ class CenterShell:
             if time.time_ns() >= linger_until:
                 break
             self._handle(self._inbox.receive(linger_until))
-        self._log.info("ended", reports=self._state.counts._asdict(), dropped=dict(self.complaints.counts))
+        self._log.info(
+            "ended",
+            reports=self._state.counts._asdict(),
+            refused=by_sensor(self._state.refused),
+            dropped=dict(self.complaints.counts),
+        )
 
     def _open(self) -> None:
         keys = self._keys
@@ -101,6 +107,7 @@ class CenterShell:
             "of": len(self._center.names),
             "tracks": len(self._picture.ids),
             "reports": self._state.counts._asdict(),
+            "refused": by_sensor(self._state.refused),
             "dropped": dict(self.complaints.counts),
         }
 
@@ -127,13 +134,22 @@ class CenterShell:
         if self._state.clock is not None and before.clock is None:
             absent = [n for n, m in zip(self._center.names, self._state.members, strict=True) if not m.joined]
             self._log.info("clock started", speed=self._center.speed or "lockstep", without=absent)
-        for kind, old, new in zip(before.counts._fields, before.counts, self._state.counts, strict=True):
-            if new > old:
-                self.complaints.add(
-                    f"{kind} message" if isinstance(event, Join) else f"{kind} report", _summary(event), new - old
-                )
+        if before.counts != self._state.counts:
+            self._complain(event, before)
         if self._inbox.empty:
             self._state = self._center.prepare(self._state)
+
+    def _complain(self, event: Event, before: State) -> None:
+        """Say what did not go the straight way, and of which sensor."""
+        now, what = self._state, "message" if isinstance(event, Join) else "report"
+        sensor = getattr(event, "sensor", "")
+        # Whoever reaches the network may invent names.
+        about = {"sensor": sensor} if sensor in self._center.names else {}
+        reasons = [key[1] for key, number in now.refused.items() if number != before.refused.get(key)]
+        for kind, old, new in zip(now.counts._fields, before.counts, now.counts, strict=True):
+            if new > old:
+                why = ": ".join([*(reasons if kind == "refused" else []), _summary(event)])
+                self.complaints.add(f"{kind} {what}", why, new - old, **about)
 
     def _say_presence(self, name: str, alive: bool) -> None:
         if name not in self._center.names:
@@ -165,6 +181,6 @@ def _summary(event: Event) -> str:
         case Report() | Picked():
             return f"{event.sensor} at {event.time_ns} ns, epoch {event.epoch}, {len(event.ids)} tracks"
         case Join():
-            return f"{event.sensor} asks to join with the scenario of digest {event.digest}; the center's is another"
+            return f"{event.sensor} asks to join with a scenario of digest {event.digest}"
         case _:
             return type(event).__name__

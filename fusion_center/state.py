@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from common.estimation.gaussian import Gaussian
 from common.messages import NEVER, Clock, Decision, IntArray, Join, Picked, Rebase, Report
 from fusion_center.factors import Expected, Heard
 from fusion_center.picture import Backup, Picture
+from fusion_center.refusal import Refusal, Refused, add
 from fusion_center.selected import ExpectedTracks, HeardPlots
 
 
@@ -41,8 +43,8 @@ class AnyFuser(Protocol):
         """Add tracks."""
         ...
 
-    def heard(self, report: Report | Picked) -> AnyHeard | None:
-        """A report taken apart, if it can be computed with."""
+    def heard(self, report: Report | Picked) -> AnyHeard | Refusal:
+        """A report taken apart, or why it cannot be computed with."""
         ...
 
     def backup(self, picture: Picture, number: int) -> Backup:
@@ -167,6 +169,7 @@ class State(NamedTuple):
         base_lineage: its lineage.
         history: checkpoints inside the window, oldest first.
         counts: of reports.
+        refused: how often each sensor was refused for each reason; the sum is ``counts.refused``.
         told: the rebases that reports may descend from, oldest first.
         next_id: of the next track that begins.
         expected: worked out ahead for the next measurement time, or None. It saves time and changes nothing.
@@ -180,6 +183,7 @@ class State(NamedTuple):
     base_ns: int
     history: tuple[Checkpoint, ...]
     counts: Counts
+    refused: Refused = MappingProxyType({})
     base_lineage: int = 0
     told: tuple[Told, ...] = ()
     next_id: int = 0
@@ -212,3 +216,7 @@ class State(NamedTuple):
     def counted(self, what: str) -> State:
         """The state with one more report of a kind of ``Counts``."""
         return self._replace(counts=self.counts._replace(**{what: getattr(self.counts, what) + 1}))
+
+    def refuse(self, sensor: str, refusal: Refusal) -> State:
+        """The state with one more refused report or request of a sensor."""
+        return self.counted("refused")._replace(refused=add(self.refused, sensor, refusal))

@@ -137,7 +137,13 @@ def test_an_unknown_sensor_gets_no_answer() -> None:
     stage = Stage(scenario())
     assert stage.tell(Join("c", 1, stage.ns(2.0), stage.center.digest)) == []
     assert stage.tell(Presence("c", alive=True)) == []
-    assert stage.state.counts.refused == 1
+    assert stage.state.refused == {("c", "unknown sensor"): 1}
+
+
+def test_a_sensor_with_another_scenario_gets_no_answer() -> None:
+    stage = Stage(scenario())
+    assert stage.tell(Join("a", 1, stage.ns(2.0), "another")) == []
+    assert stage.state.refused == {("a", "another scenario"): 1}
 
 
 # Order ----------------------------------------------------------------------------------------------------------------
@@ -459,7 +465,7 @@ def test_a_report_older_than_the_window_is_counted_and_dropped() -> None:
 def test_a_wrong_clock_makes_nobody_else_late() -> None:
     stage = pair(fusion={"window": 4.0}, decision=UNDECIDED)
     assert stage.tell(stage.report("a", 86_400.0), 0.1) == []
-    assert stage.state.counts.refused == 1
+    assert stage.state.refused == {("a", "time too far ahead"): 1}
     stage.tell(stage.report("b", 2.0), 0.2)
     assert stage.tell(stage.report("a", 2.0), 0.3)
     assert stage.state.counts.late == 0
@@ -475,37 +481,88 @@ def test_a_late_report_may_have_a_time_of_its_own() -> None:
     assert stage.tracks.scans.tolist() == [3]
 
 
-REFUSED: dict[str, dict[str, Any]] = {
-    "unknown sensor": {"sensor": "z"},
-    "older epoch": {"epoch": 1},
-    "newer epoch": {"epoch": 99},
-    "wrong state": {"x": np.zeros((1, 6)), "P": np.eye(6)[None]},
-    "wrong state, no tracks": {"ids": np.empty(0, np.int64), "terms": np.empty(0, np.int64), **no_tracks(6)},
-    "covariance indefinite": {"P": np.diag([1.0, 1.0, 1.0, -1.0])[None]},
-    "covariance zero": {"P": np.zeros((1, 4, 4))},
-    "next scan now": {"next_ns": scenario().to_ns(2.0)},
-    "next scan before": {"next_ns": scenario().to_ns(1.0)},
-    "two terms": {
-        "terms": np.array([2]),
-        "log_g": np.zeros(2),
-        "x": np.zeros((2, 4)),
-        "P": np.tile(np.eye(4), (2, 1, 1)),
-    },
+#: Reports that are not the next one of their sensor.
+MISPLACED: dict[str, tuple[str, dict[str, Any]]] = {
+    "unknown sensor": ("unknown sensor", {"sensor": "z"}),
+    "older epoch": ("older epoch", {"epoch": 1}),
+    "newer epoch": ("epoch not in force", {"epoch": 99}),
+    "next scan now": ("next scan not after this one", {"next_ns": scenario().to_ns(2.0)}),
+    "next scan before": ("next scan not after this one", {"next_ns": scenario().to_ns(1.0)}),
+}
+
+#: Reports that are the next one of their sensor, and cannot be computed with.
+UNFIT: dict[str, tuple[str, dict[str, Any]]] = {
+    "wrong state": ("wrong dimensions", {"x": np.zeros((1, 6)), "P": np.eye(6)[None]}),
+    "wrong state, no tracks": (
+        "wrong dimensions",
+        {"ids": np.empty(0, np.int64), "terms": np.empty(0, np.int64), **no_tracks(6)},
+    ),
+    "covariance indefinite": ("covariance not positive definite", {"P": np.diag([1.0, 1.0, 1.0, -1.0])[None]}),
+    "covariance zero": ("covariance not positive definite", {"P": np.zeros((1, 4, 4))}),
+    "correlation too large": ("covariance not positive definite", {"P": (np.eye(4) + 2.0 * np.eye(4)[::-1])[None]}),
+    "covariance tiny": ("numbers out of range", {"P": 1e-300 * np.eye(4)[None]}),
+    "covariance huge": ("numbers out of range", {"P": 1e300 * np.eye(4)[None]}),
+    "state huge": ("numbers out of range", {"x": np.full((1, 4), 1e200)}),
+    "two terms": (
+        "too many terms",
+        {"terms": np.array([2]), "log_g": np.zeros(2), "x": np.zeros((2, 4)), "P": np.tile(np.eye(4), (2, 1, 1))},
+    ),
 }
 
 
-@pytest.mark.parametrize("changes", REFUSED.values(), ids=REFUSED.keys())
+@pytest.mark.parametrize(("why", "changes"), MISPLACED.values(), ids=MISPLACED.keys())
 @pytest.mark.parametrize("speed", [0.0, 1.0])
-def test_a_report_that_does_not_fit_is_refused(changes: dict[str, Any], speed: float) -> None:
+def test_a_report_that_is_not_the_next_of_its_sensor_changes_nothing_but_the_counts(
+    why: str, changes: dict[str, Any], speed: float
+) -> None:
     stage = pair(speed)
     before = stage.state
-    assert stage.tell(stage.report("a", 2.0, **changes)) == []
+    report = stage.report("a", 2.0, **changes)
+    assert stage.tell(report) == []
     assert stage.state.counts.refused == 1
-    assert stage.state._replace(counts=before.counts) == before
+    assert stage.state.refused == {(report.sensor, why): 1}
+    assert stage.state._replace(counts=before.counts, refused=before.refused) == before
     assert stage.tick(100.0) == []
     # The network goes on.
     stage.tell(stage.report("a", 2.0), 200.0)
     assert times_s(stage, stage.tell(stage.report("b", 2.0), 200.0)) == [2.0]
+
+
+@pytest.mark.parametrize(("why", "changes"), UNFIT.values(), ids=UNFIT.keys())
+@pytest.mark.parametrize("speed", [0.0, 1.0])
+def test_a_scan_whose_report_cannot_be_computed_with_is_a_silent_one(
+    why: str, changes: dict[str, Any], speed: float
+) -> None:
+    silent, stage = pair(speed), pair(speed)
+    silent.tell(silent.report("a", 2.0))
+    stage.tell(stage.report("a", 2.0))
+    # What is left of b's report is when the next one is due: as if b had looked away at 2 s.
+    silent.tell(Presence("b", alive=False))
+    silent.tell(Presence("b", alive=True))
+    pictures = stage.tell(stage.report("b", 2.0, **changes))
+    assert stage.state.refused == {("b", why): 1}
+    assert times_s(stage, pictures) == [2.0]
+    assert same(stage.tracks, silent.tracks)
+    stage.tell(stage.report("b", 4.0))
+    assert times_s(stage, stage.tell(stage.report("a", 4.0))) == [4.0]
+
+
+def test_in_lockstep_the_nodes_may_go_on_after_a_report_that_cannot_be_computed_with() -> None:
+    stage = pair(speed=0.0)
+    stage.tell(stage.report("a", 2.0, next_s=3.0, P=np.zeros((1, 4, 4))))
+    stage.tell(stage.report("b", 2.0, next_s=5.0, P=np.zeros((1, 4, 4))))
+    assert stage.clear_s[-1] == 3.0
+    stage.tell(stage.report("a", 3.0, next_ns=NEVER, P=np.zeros((1, 4, 4))))
+    stage.tell(stage.report("b", 5.0, next_ns=NEVER, P=np.zeros((1, 4, 4))))
+    assert stage.state.finished
+
+
+def test_names_that_somebody_invents_do_not_fill_the_counts() -> None:
+    stage = pair()
+    for number in range(2000):
+        stage.tell(stage.report("a", 2.0, sensor=f"ghost-{number}"))
+    assert stage.state.counts.refused == sum(stage.state.refused.values()) == 2000
+    assert len(stage.state.refused) < 1000
 
 
 @pytest.mark.parametrize(
@@ -525,7 +582,7 @@ def test_a_report_of_a_sensor_that_has_not_joined_is_refused() -> None:
     stage = Stage(scenario())
     stage.join("a", 2.0)
     assert stage.tell(stage.report("b", 2.0)) == []
-    assert stage.state.counts.refused == 1
+    assert stage.state.refused == {("b", "not joined"): 1}
 
 
 def test_a_report_on_tracks_that_are_not_known_is_worked_in_without_them() -> None:

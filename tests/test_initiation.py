@@ -121,11 +121,11 @@ def test_plots_that_are_no_place_start_nothing() -> None:
     starts = initiation_of(plot)
     assert len(starts.seeds(picture(plot, []), [seen([[0.0, 1.0], [900.0, 1.0]])], []).x) == 1
     report = Stage(plot).report("a", 2.0, position=np.zeros(2), unclaimed=np.array([[900.0, 1.0]]))
-    assert starts.fits(report, 0)
-    assert not starts.fits(report._replace(unclaimed=np.array([[1e160, 1.0]])), 0)
-    assert not starts.fits(report._replace(position=np.zeros(3)), 0)
-    assert not starts.fits(report._replace(unclaimed=np.array([[1.0]])), 0)
-    assert not starts.fits(report._replace(unclaimed=np.array([[1.0]])), 1)
+    assert starts.fault(report, 0) is None
+    assert starts.fault(report._replace(unclaimed=np.array([[1e160, 1.0]])), 0) == "unclaimed plots out of range"
+    assert starts.fault(report._replace(position=np.zeros(3)), 0) == "unclaimed plots of another sensor"
+    assert starts.fault(report._replace(unclaimed=np.array([[1.0]])), 0) == "unclaimed plots of another sensor"
+    assert starts.fault(report._replace(unclaimed=np.array([[1.0]])), 1) == "unclaimed plots of another sensor"
 
 
 def two_boats(**tables: Any) -> Scenario:

@@ -71,11 +71,11 @@ def steps(scenario: Scenario) -> dict[str, Callable[[], object]]:
             before, waiting = nodes[name], fused
             nodes[name], report = tracker.scan(before, scan, next_ns)
             fused, _ = center.step(waiting, report, 0)
-    ready, expecting = tracker.prepare(before, scan.time_ns, scan.position), center.prepare(waiting)
+    ready, expecting = tracker.prepare(before, scan.time_ns, scan.pose), center.prepare(waiting)
     return {
         "node": lambda: tracker.scan(before, scan, next_ns),
         "node, ahead": lambda: tracker.scan(ready, scan, next_ns),
-        "node prepares": lambda: tracker.prepare(before, scan.time_ns, scan.position),
+        "node prepares": lambda: tracker.prepare(before, scan.time_ns, scan.pose),
         "center": lambda: center.step(waiting, report, 0),
         "center, ahead": lambda: center.step(expecting, report, 0),
         "center prepares": lambda: center.prepare(waiting),

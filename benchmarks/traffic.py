@@ -76,6 +76,8 @@ def _proposals(world: World, scan: Scan) -> Report:
         x=np.empty((0, n)),
         P=np.empty((0, n, n)),
         position=scan.position,
+        velocity=scan.velocity,
+        heading=scan.heading,
         unclaimed=scan.z[distances > _UNCLAIMED_M],
     )
 

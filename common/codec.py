@@ -2,7 +2,8 @@
 
 A payload is one msgpack array ``[version, kind, scalars, sizes, blocks]``: the scalars of the message in order, the
 sizes of its array axes, and all arrays as raw little-endian blocks in one ``bin``. A report of 1000 tracks is decoded
-without a loop over tracks. Covariances travel as their upper triangles, row by row. See docs/wire-format.md.
+without a loop over tracks. Covariances travel as their upper triangles, row by row. What a sensor says while it moves
+or is turned has a sixth element, its velocity and heading. See docs/wire-format.md.
 """
 
 from __future__ import annotations
@@ -136,6 +137,9 @@ _ROUNDED = {Report: ROUNDED, Picked: ROUNDED_PLOTS}
 _MAX_STATE = 64
 #: Messages whose sensor is the one in the key.
 _KEYED = (Report, Picked, Scan, Join, Start, Stop)
+#: Messages that have a velocity and a heading, which are sent where they are not zero.
+_POSED = (Report, Picked, Scan)
+_POSE = ("velocity", "heading")
 
 _TO_WIRE: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "str": str, "tuple": list}
 _EXPECTED = {"int": "a 64-bit integer", "float": "a finite float", "str": "a text", "tuple": "an array of texts"}
@@ -170,7 +174,14 @@ def encode(message: Message, *, rounded: bool = False) -> bytes:
         assert wire.dtype.kind != "u" or (wire == array).all(), f"{block.field} does not fit into {block.dtype}"
         raw.append(wire.tobytes())
     scalars = [_TO_WIRE[hint](getattr(message, name)) for name, hint in _scalars(kind)]
-    return bytes(msgpack.packb([VERSION, kind, scalars, list(sizes.values()), b"".join(raw)]))
+    return bytes(msgpack.packb([VERSION, kind, scalars, list(sizes.values()), b"".join(raw), *_pose(message)]))
+
+
+def _pose(message: Message) -> list[bytes]:
+    """Velocity and heading of a sensor that moves or is turned; otherwise nothing."""
+    if not isinstance(message, _POSED) or (not len(message.velocity) and message.heading == 0.0):
+        return []
+    return [np.append(message.velocity, message.heading).astype("<f8").tobytes()]
 
 
 def decode(key: str, payload: bytes) -> Message:
@@ -204,14 +215,16 @@ def _open(payload: bytes) -> tuple[int, list[Any]]:
 
 
 def _decode_body(sensor: str, body: list[Any]) -> Message:
-    if len(body) != 4:
+    if len(body) not in (4, 5):
         raise DecodeError(f"{len(body) + 1} elements, expected 5: version, kind, scalars, sizes, blocks")
-    kind, scalars, sizes, blocks = body
+    kind, scalars, sizes, blocks, *pose = body
     if not _is_int(kind) or kind not in LAYOUTS:
         raise DecodeError(f"kind {_shown(kind)} is unknown")
     message = LAYOUTS[kind][0]
     fields = _decode_scalars(message, _scalars(kind), scalars)
     fields.update(_decode_blocks(kind, sizes, blocks))
+    if pose:
+        fields.update(_decode_pose(message, len(fields.get("position", ())), *pose))
     if message in _KEYED:
         if not sensor:
             raise DecodeError(f"a {message.__name__} does not belong on this key")
@@ -263,6 +276,20 @@ def _decode_blocks(kind: int, sizes: Any, blocks: Any) -> dict[str, _AnyArray]:
         array = np.frombuffer(blocks, block.dtype, place.numbers, place.offset).astype(block.kind).reshape(place.shape)
         fields[block.field] = array if place.full is None else array[..., place.full]
     return fields
+
+
+def _decode_pose(message: type, d: int, pose: Any) -> dict[str, Any]:
+    """Velocity and heading of a sensor whose place has ``d`` numbers."""
+    if message not in _POSED:
+        raise DecodeError(f"a {message.__name__} has 5 elements, not 6")
+    sizes = sorted({8, 8 * (d + 1)})
+    if not isinstance(pose, bytes) or len(pose) not in sizes:
+        expected = " or ".join(map(str, sizes))
+        raise DecodeError(f"velocity and heading are {_shown(pose)}, expected a bin of {expected} bytes")
+    *velocity, heading = np.frombuffer(pose, "<f8").tolist()
+    if not math.isfinite(heading):
+        raise DecodeError(f"heading is {heading}, expected a finite float")
+    return {"velocity": np.array(velocity, np.float64), "heading": heading}
 
 
 class _Place(NamedTuple):
@@ -343,7 +370,7 @@ def _scalars(kind: int) -> tuple[tuple[str, str], ...]:
     return tuple(
         (name, names.get(hint, "str"))
         for name, hint in get_type_hints(message).items()
-        if name not in blocks and not (name == "sensor" and message in _KEYED)
+        if name not in (*blocks, *_POSE) and not (name == "sensor" and message in _KEYED)
     )
 
 

@@ -29,6 +29,10 @@ class PlotsError(WaldnetError):
     """A file of recorded plots is wrong; the message names file and line."""
 
 
+class PlotsWarning(UserWarning):
+    """A file of recorded plots may not mean what it is read as; the message names file and line."""
+
+
 class DecodeError(WaldnetError):
     """Bytes that are no message of ours: what was got and what was expected."""
 

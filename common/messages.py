@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from common.estimation.gaussian import Array, BoolArray
+from common.estimation.pose import SensorPose
 from common.estimation.sprt import StatusArray
 
 IntArray = NDArray[np.int64]
@@ -40,6 +41,8 @@ class Report(NamedTuple):
         P: covariances, shape (N, n, n).
         position: where the sensor stood [m], shape (d,); with unclaimed plots only.
         unclaimed: plots that no track claims, from which tracks may start (theory.md §8), shape (U, m).
+        velocity: of the sensor over ground [m/s], shape (d,); (0,) where it is not told.
+        heading: of its platform [rad], clockwise from north.
     """
 
     sensor: str
@@ -54,6 +57,13 @@ class Report(NamedTuple):
     P: Array
     position: Array = _NOWHERE
     unclaimed: Array = _NO_PLOTS
+    velocity: Array = _NOWHERE
+    heading: float = 0.0
+
+    @property
+    def pose(self) -> SensorPose:
+        """Where the sensor was, and how it moved."""
+        return SensorPose(self.position, self.velocity, self.heading)
 
 
 class Picked(NamedTuple):
@@ -71,6 +81,8 @@ class Picked(NamedTuple):
         which: their places in z, track after track, shape (N,).
         z: plots that matter to any track, shape (M, m).
         unclaimed: plots that no track claims, from which tracks may start (theory.md §8), shape (U, m).
+        velocity: of the sensor over ground [m/s], shape (d,); (0,) where it is not told.
+        heading: of its platform [rad], clockwise from north.
     """
 
     sensor: str
@@ -84,6 +96,13 @@ class Picked(NamedTuple):
     which: IntArray
     z: Array
     unclaimed: Array
+    velocity: Array = _NOWHERE
+    heading: float = 0.0
+
+    @property
+    def pose(self) -> SensorPose:
+        """Where the sensor was, and how it moved."""
+        return SensorPose(self.position, self.velocity, self.heading)
 
 
 class Scan(NamedTuple):
@@ -93,13 +112,22 @@ class Scan(NamedTuple):
         sensor: who saw it.
         time_ns: time of the scan.
         position: where the sensor stood [m], shape (d,).
-        z: plots, shape (M, m).
+        z: plots, shape (M, m); azimuths count from north.
+        velocity: of the sensor over ground [m/s], shape (d,); (0,) where it is not told.
+        heading: of its platform [rad], clockwise from north.
     """
 
     sensor: str
     time_ns: int
     position: Array
     z: Array
+    velocity: Array = _NOWHERE
+    heading: float = 0.0
+
+    @property
+    def pose(self) -> SensorPose:
+        """Where the sensor was, and how it moved."""
+        return SensorPose(self.position, self.velocity, self.heading)
 
 
 class Join(NamedTuple):

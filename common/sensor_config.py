@@ -17,6 +17,7 @@ from common.estimation.field_of_view import AllAround, Box, Disc, Everywhere, Fi
 from common.estimation.gaussian import Array
 from common.estimation.motion import Motion
 from common.estimation.polar import Bearing, Polar, PolarDoppler
+from common.estimation.pose import SensorPose
 from common.estimation.sector import Sector
 from common.estimation.sensing import Measurement, Position, Sensor
 from common.estimation.sigma_points import SigmaPoint
@@ -63,7 +64,7 @@ class EverywhereConfig(Model):
 
 
 class BoxConfig(Model):
-    """A box with full side lengths ``size`` [m]; without a center it moves with the sensor."""
+    """A box with full side lengths ``size`` [m]; without a center it moves and turns with the sensor."""
 
     shape: Literal["box"]
     size: tuple[Positive, ...]
@@ -87,12 +88,12 @@ class DiscConfig(Model):
 
 
 class SectorConfig(Model):
-    """A sector around the sensor, with which it moves.
+    """A sector around the sensor, with which it moves and turns.
 
     Attributes:
         radius: largest range [m].
         inner: smallest range [m].
-        direction: azimuth of its middle [rad], clockwise from north.
+        direction: azimuth of its middle [rad], clockwise from the sensor's heading, without one from north.
         width: span of azimuths [rad], up to 2 pi.
         elevation: lowest and highest elevation [rad], in 3-D only; default: all.
     """
@@ -202,12 +203,18 @@ class SensorConfig(Model):
             and range rate; bearing: azimuth(, elevation).
         sigma: standard deviations of a plot, one per number of it [m, rad, m/s].
         position: east, north (, up) [m]; a recorded scan may override it. Default: the origin.
+        velocity: of the sensor over ground, which range rates are relative to [m/s]; a recorded scan may override it.
+            Default: 0; zeros say that range rates are over ground, however the sensor moves.
+        heading: of its platform [rad], clockwise from north, with which fields of view turn; a recorded scan may
+            override it. Default: 0.
+        azimuth: what azimuths in plots files count from: north, or the platform's heading.
         p_d: detection probability inside the field of view; with the detection model "swerling" there is none.
         detection: how the detection probability depends on the target.
         visibility: how long targets stay visible and hidden to this sensor; default: visible all the time.
         false_plots: mean false plots per scan, uniform in the field of view.
         clutter_map: learns where they are denser and where less; without it they are uniform.
-        max_speed: of polar-doppler: false plots have range rates uniform between its negative and itself [m/s].
+        max_speed: of polar-doppler: false plots have range rates, relative to the sensor, uniform between its negative
+            and itself [m/s].
         update: how plots that are not linear in the state are worked in.
         scan_interval: seconds between scans.
         spacing: scans that come sooner than this after the last one are passed over [s]: a sensor whose errors last
@@ -218,6 +225,9 @@ class SensorConfig(Model):
     name: Name
     kind: Literal["position", "polar", "polar-doppler", "bearing"] = "position"
     position: tuple[Finite, ...] | None = None
+    velocity: tuple[Finite, ...] | None = None
+    heading: Angle | None = None
+    azimuth: Literal["north", "heading"] = "north"
     sigma: tuple[Positive, ...]
     p_d: Probability | None = None
     detection: DetectionConfig = ConstantConfig()
@@ -240,6 +250,7 @@ class SensorConfig(Model):
             self.field_of_view.build(motion.dimensions),
             self.detection.build(),
             None if self.visibility is None else self.visibility.build(),
+            fixed_view=isinstance(self.field_of_view, BoxConfig) and self.field_of_view.center is not None,
         )
 
     def clutter_model(self, motion: Motion) -> ClutterModel | None:
@@ -275,6 +286,20 @@ class SensorConfig(Model):
         """Where the sensor stands during a scan [m], shape (d,)."""
         return np.array(moved_to or self.position or (0.0,) * dimensions)
 
+    def pose(
+        self,
+        dimensions: int,
+        position: Array | None = None,
+        velocity: Array | None = None,
+        heading: float | None = None,
+    ) -> SensorPose:
+        """Pose of the sensor during a scan, as far as that is told; the rest as the scenario says."""
+        return SensorPose(
+            self.stand(dimensions) if position is None else position,
+            np.array(self.velocity or ()) if velocity is None else velocity,
+            self.heading or 0.0 if heading is None else heading,
+        )
+
     def view_center(self, stand: Array) -> Array:
         """Center of the field of view of a sensor that stands at ``stand``, shape (d,)."""
         fov = self.field_of_view
@@ -300,7 +325,9 @@ def sensor_faults(sensor: Mapping[str, Any], dimensions: int, where: str) -> Ite
         numbers = dimensions + {"polar-doppler": 1, "bearing": -1}.get(kind, 0)
         why = "" if kind == "position" else f"a {kind} plot in {dimensions} dimensions has {numbers}"
         yield from wrong_length(sensor, ("sigma",), numbers, where, why)
-    yield from wrong_length(sensor, ("position",), dimensions, where)
+    yield from wrong_length(sensor, ("position", "velocity"), dimensions, where)
+    if kind == "position" and sensor.get("azimuth") == "heading":
+        yield f"{where}.azimuth: a position has none; it is in the frame of the scenario"
     if isinstance(view, dict):
         yield from _view_faults(view, kind, dimensions, f"{where}.field_of_view")
     if kind == "position" and sensor.get("update") == "sigma-point":

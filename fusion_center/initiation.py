@@ -14,6 +14,7 @@ from common.estimation.gating import inside_boxes
 from common.estimation.gaussian import Array, BoolArray, Gaussian, quadratic
 from common.estimation.initiation import apart, from_plots, with_second
 from common.estimation.motion import Motion
+from common.estimation.pose import SensorPose
 from common.estimation.sensing import Measurement, Sensor
 from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE
 from common.initiation_config import InitiationConfig
@@ -32,21 +33,21 @@ class Unclaimed(NamedTuple):
     Attributes:
         time_ns: of the scan.
         number: of the sensor.
-        position: where it stood [m], shape (d,).
+        pose: of it.
         ids: tracks that the node knew, ascending, shape (T,).
         z: the plots, shape (U, m).
     """
 
     time_ns: int
     number: int
-    position: Array
+    pose: SensorPose
     ids: IntArray
     z: Array
 
     @classmethod
     def of(cls, number: int, report: Report | Picked) -> Unclaimed:
         """Those that a sensor reports."""
-        return cls(report.time_ns, number, report.position, report.ids, report.unclaimed)
+        return cls(report.time_ns, number, report.pose, report.ids, report.unclaimed)
 
 
 class Duplicate(NamedTuple):
@@ -86,7 +87,7 @@ class Initiation:
         d = self.motion.dimensions
         if (z.shape[1], len(stand)) != (measurement.m, d) or measurement.m < d:
             return "unclaimed plots of another sensor"
-        near = (np.abs(z) < _LARGEST).all() and (np.abs(stand) < _LARGEST).all()
+        near = all((np.abs(numbers) < _LARGEST).all() for numbers in (z, stand, report.velocity))
         return None if near else "unclaimed plots out of range"
 
     def seeds(self, picture: Picture, now: Sequence[Unclaimed], before: Sequence[Unclaimed]) -> Gaussian:
@@ -166,7 +167,7 @@ class Initiation:
             start = self._from_plots(earlier)
             dt = np.full(len(first), (scan.time_ns - earlier.time_ns) / NS_PER_S)
             chosen = Gaussian(start.x[first], start.P[first])
-            density, distance = with_second(chosen, dt, scan.z[second], measurement, scan.position, self.motion)
+            density, distance = with_second(chosen, dt, scan.z[second], measurement, scan.pose.position, self.motion)
             fits = (distance <= gate) & self._slow(density)
             distance = np.where(fits, distance, np.inf).reshape(-1, count)
             closest = distance.argmin(axis=0) * count + np.arange(count)
@@ -177,11 +178,11 @@ class Initiation:
         return Gaussian(x[found], P[found])
 
     def _measurement(self, scan: Unclaimed) -> Measurement:
-        return self.sensors[scan.number].measurement
+        return self.sensors[scan.number].at(scan.pose).measurement
 
     def _from_plots(self, scan: Unclaimed) -> Gaussian:
         spread = self.config.spread(self.motion.n, self.motion.dimensions)
-        return from_plots(scan.z, self._measurement(scan), scan.position, spread)
+        return from_plots(scan.z, self._measurement(scan), scan.pose.position, spread)
 
     def _slow(self, density: Gaussian) -> BoolArray:
         """No faster than a target can be, as far as that is known, and somewhere."""

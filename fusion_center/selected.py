@@ -14,6 +14,7 @@ from common.estimation.association import Plots
 from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, moments
 from common.estimation.mixture import Mixture
+from common.estimation.pose import SensorPose
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds
 from common.local_filter import SUREST, LocalFilter
@@ -62,14 +63,14 @@ class _Seen(NamedTuple):
 
     Attributes:
         number: of the sensor.
-        position: where it stood [m], shape (d,).
+        pose: of it.
         plots: of every track its own.
         many: how many there are in all.
         existence: probability of the tracks to exist, before, shape (T,).
     """
 
     number: int
-    position: Array
+    pose: SensorPose
     plots: Plots
     many: int
     existence: Array
@@ -191,7 +192,7 @@ class SelectedFuser:
             who[rows, number] = True
             assert plots.valid is not None and plots.number is not None
             theirs = Plots(plots.z[others], plots.valid[others], number=plots.number[others])
-            seen = _Seen(number, report.position, theirs, len(report.z), existence[rows])
+            seen = _Seen(number, report.pose, theirs, len(report.z), existence[rows])
             mixture = self._filtered(mixture, rows, seen)
         # Weights start each time with sum one, so their sum is the evidence of this time alone.
         step = log_sum_exp(mixture.log_g)
@@ -226,7 +227,7 @@ class SelectedFuser:
     def _filtered(self, mixture: Mixture, rows: IntArray | slice, seen: _Seen) -> Mixture:
         """The mixtures after a scan of one sensor; tracks that it does not know stay as they are."""
         config, sensor = self.sensors[seen.number]
-        stand = seen.position
+        sensor, stand = sensor.at(seen.pose), seen.pose.position
         density = Gaussian(*(part[:, rows] for part in mixture.density))
         mine = Mixture(mixture.log_w[rows], mixture.log_g[rows], density)
         expected = self.filter.expect(mine.density, sensor, stand, config.view_center(stand))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import warnings
 from contextlib import nullcontext
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -238,4 +239,10 @@ def schema() -> None:
 
 def main() -> None:
     """Entry point of ``waldnet``."""
+    warnings.showwarning = _warn
     run_app(app)
+
+
+def _warn(message: Warning | str, *_where: object, **_place: object) -> None:
+    """Say a warning as errors are said: one line."""
+    print(f"warning: {message}", file=sys.stderr)

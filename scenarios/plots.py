@@ -1,24 +1,31 @@
 """Recorded plots as JSON Lines: one scan a line, empty scans too.
 
 ``{"sensor": "radar-1", "time": 2.0, "plots": [[x, y], ...]}``: time in seconds since the scenario's epoch, plots in the
-sensor's own measurement space (docs/how-to/sensors.md); a sensor that moves gives its ``position``.
+sensor's own measurement space (docs/how-to/sensors.md); a sensor that moves gives its ``position``, its ``velocity``
+over ground, and the ``heading`` of its platform. In a ``Scan`` azimuths count from north, whatever the file's count
+from.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
 import numpy as np
 
-from common.config import Scenario
-from common.errors import PlotsError
+from common.config import Scenario, SensorConfig
+from common.errors import PlotsError, PlotsWarning
 from common.estimation.gaussian import Array
+from common.estimation.pose import SensorPose
 from common.messages import Scan
+from common.quantities import NS_PER_S
 from scenarios.json_lines import numbers, read_lines, seconds
 
+#: What a line may say of the sensor.
+_POSE = ("position", "velocity", "heading")
 #: Numbers of a plot that cannot be just any: degrees, for example, are soon found out.
 _RANGES = {
     "range": (0.0, np.inf, "distance"),
@@ -39,6 +46,9 @@ def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
 
     Raises:
         PlotsError: naming file, line and reason of every fault, up to a bound.
+
+    Warns:
+        PlotsWarning: where a sensor that measures range rates moves, and its velocity is not told.
     """
     first_line: dict[tuple[str, int], int] = {}
 
@@ -50,11 +60,42 @@ def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
             )
         return scan
 
-    lines = read_lines(path, "scan", ("sensor", "time", "plots"), parse, PlotsError, ("position",))
+    lines = read_lines(path, "scan", ("sensor", "time", "plots"), parse, PlotsError, _POSE)
     scans = [scan for scan in lines if scan is not None]
     if not scans:
         raise PlotsError(f"{path}: has no scan, expected one a line")
-    return in_order(scans, scenario)
+    scans = in_order(scans, scenario)
+    for config in scenario.sensors:
+        if config.kind == "polar-doppler":
+            own = [scan for scan in scans if scan.sensor == config.name]
+            _check_velocities(path, own, [first_line[scan.sensor, scan.time_ns] for scan in own])
+    return scans
+
+
+def _check_velocities(path: Path, scans: Sequence[Scan], lines: Sequence[int]) -> None:
+    """Range rates of a sensor that moves can only be read with its velocity.
+
+    Args:
+        path: the file.
+        scans: of a sensor that measures range rates, by time.
+        lines: that they stand in.
+    """
+    without = [line for scan, line in zip(scans, lines, strict=True) if not len(scan.velocity)]
+    if without and len(without) < len(scans):
+        told = min(set(lines) - set(without))
+        reason = f"velocity is missing: {scans[0].sensor} measures range rates, and line {told} has one"
+        raise PlotsError(f"{path}:{min(without)}: {reason}")
+    positions = np.array([scan.position for scan in scans])
+    moves = np.flatnonzero((positions[1:] != positions[:-1]).any(axis=-1))
+    if without and len(moves):
+        seconds_between = np.diff([scan.time_ns for scan in scans]) / NS_PER_S
+        speeds = np.linalg.vector_norm(np.diff(positions, axis=0), axis=-1) / seconds_between
+        text = (
+            f"{path}:{lines[moves[0] + 1]}: {scans[0].sensor} measures range rates and moves (median speed "
+            f"{np.median(speeds):.3g} m/s), but no velocity is told: its range rates are taken as over ground. If they "
+            "are relative to the sensor, each line needs its velocity; else velocity = [0, 0] in [[sensor]] says so"
+        )
+        warnings.warn(text.replace("[0, 0]", str([0] * positions.shape[1])), PlotsWarning, stacklevel=3)
 
 
 def in_order(scans: Iterable[Scan], scenario: Scenario) -> list[Scan]:
@@ -66,12 +107,18 @@ def in_order(scans: Iterable[Scan], scenario: Scenario) -> list[Scan]:
 def write_plots(file: TextIO, scans: Iterable[Scan], scenario: Scenario) -> None:
     """Write scans as JSON Lines."""
     for scan in scans:
-        line = {
+        config = scenario.sensor(scan.sensor)
+        relative = config.azimuth == "heading"
+        line: dict[str, Any] = {
             "sensor": scan.sensor,
             "time": scenario.to_seconds(scan.time_ns),
             "position": scan.position.tolist(),
-            "plots": scan.z.tolist(),
         }
+        if len(scan.velocity):
+            line["velocity"] = scan.velocity.tolist()
+        if relative or scan.heading != (config.heading or 0.0):
+            line["heading"] = scan.heading
+        line["plots"] = (_turned(scan.z, config, -scan.heading) if relative else scan.z).tolist()
         file.write(json.dumps(line) + "\n")
 
 
@@ -83,8 +130,7 @@ def _parse(entry: dict[str, Any], scenario: Scenario) -> Scan | None:
     if name not in scenario.sensor_names:
         raise ValueError(f"sensor: {name!r} is not one of {', '.join(scenario.sensor_names)}")
     sensor = scenario.sensor(name)
-    d = scenario.motion.dimensions
-    position = sensor.stand(d) if entry.get("position") is None else _vector(entry["position"], d, "position")
+    pose = _pose(entry, sensor, scenario.motion.dimensions)
     plots = entry["plots"]
     if not isinstance(plots, list):
         raise ValueError(f"plots: {plots!r} is not a list of plots")
@@ -92,7 +138,32 @@ def _parse(entry: dict[str, Any], scenario: Scenario) -> Scan | None:
     z = [_vector(plot, m, f"plots.{j}") for j, plot in enumerate(plots)]
     for j, plot in enumerate(z):
         _check_range(plot, sensor.numbers, f"plots.{j}")
-    return Scan(name, scenario.to_ns(time_s), position, np.array(z).reshape(-1, m))
+    seen = np.array(z).reshape(-1, m)
+    if sensor.azimuth == "heading":
+        seen = _turned(seen, sensor, pose.heading)
+    return Scan(name, scenario.to_ns(time_s), pose.position, seen, pose.velocity, pose.heading)
+
+
+def _pose(entry: dict[str, Any], sensor: SensorConfig, d: int) -> SensorPose:
+    """Pose of a sensor in a line, as far as it is told."""
+    told = {key: _vector(entry[key], d, key) for key in ("position", "velocity") if entry.get(key) is not None}
+    heading = entry.get("heading")
+    if heading is not None and not _is_angle(heading):
+        raise ValueError(f"heading: {heading!r} is no angle in radians (-2 pi to 2 pi)")
+    if heading is None and sensor.heading is None and sensor.azimuth == "heading":
+        raise ValueError(f"heading is missing: azimuths of {sensor.name} count from it")
+    return sensor.pose(d, **told, heading=heading)
+
+
+def _is_angle(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= 2.0 * np.pi
+
+
+def _turned(z: Array, sensor: SensorConfig, angle: float) -> Array:
+    """Plots whose azimuths count from elsewhere, in [0, 2 pi), shape (M, m)."""
+    z, azimuth = z.copy(), sensor.numbers.index("azimuth")
+    z[:, azimuth] = np.remainder(z[:, azimuth] + angle, 2.0 * np.pi)
+    return z
 
 
 def _vector(value: Any, size: int, where: str) -> Array:

@@ -102,12 +102,13 @@ def simulate(scenario: Scenario, name: str, seed: int, world: Truth | None = Non
     rng = np.random.default_rng([seed, 2, *name.encode()])
     times_ns = scan_times_ns(scenario, config)
     states = world.x[:, np.searchsorted(world.times_ns, times_ns)]
-    sensor, stand = config.build(scenario.motion.build()), config.stand(scenario.motion.dimensions)
+    pose = config.pose(scenario.motion.dimensions)
+    sensor, stand = config.build(scenario.motion.build()).at(pose), pose.position
     center = config.view_center(stand)
     states = np.where(_visible(sensor, len(states), times_ns, seed, name)[..., None], states, np.nan)
     sources = [source for source in scenario.clutter_sources if source.sensors is None or name in source.sensors]
     return [
-        Scan(name, int(t_ns), stand, _plots(sensor, stand, center, states[:, k], sources, rng))
+        Scan(name, int(t_ns), stand, _plots(sensor, stand, center, states[:, k], sources, rng), *pose[1:])
         for k, t_ns in enumerate(times_ns)
     ]
 

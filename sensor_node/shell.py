@@ -258,7 +258,7 @@ class NodeShell:
         if due_ns is not None and due_ns - time.time_ns() > _AHEAD_NS:
             return due_ns - _AHEAD_NS
         scan = self._scans[self._position]
-        self._state = self._tracker.prepare(self._state, scan.time_ns, scan.position)
+        self._state = self._tracker.prepare(self._state, scan.time_ns, scan.pose)
         return due_ns
 
     def _process(self, scan: Scan) -> None:

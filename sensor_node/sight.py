@@ -13,6 +13,7 @@ from common.estimation.association import Expected, Plots
 from common.estimation.clutter_map import ClutterMap, ClutterModel
 from common.estimation.gaussian import Array
 from common.estimation.mixture import Mixture
+from common.estimation.pose import SensorPose
 from common.estimation.sensing import Sensor
 from common.local_filter import DOUBT, Left, LocalFilter
 from sensor_node.state import Look, Tracks
@@ -63,17 +64,17 @@ class Sight:
         """Whether it is asked which plots belong to none of the tracks."""
         return self.claimed is not None or self.clutter is not None
 
-    def expect(self, local: LocalFilter, predicted: Mixture, position: Array, visible: Array) -> Expected:
+    def expect(self, local: LocalFilter, predicted: Mixture, pose: SensorPose, visible: Array) -> Expected:
         """What the sensor will see of predicted tracks.
 
         Args:
             local: the filter that predicted them.
             predicted: the tracks.
-            position: where the sensor will stand [m], shape (d,).
+            pose: of the sensor then.
             visible: probability of each track to be visible to it, shape (T,).
         """
-        known = None if self.sensor.visibility is None else visible
-        return local.expect(predicted.density, self.sensor, position, self.config.view_center(position), known)
+        known, stand = None if self.sensor.visibility is None else visible, pose.position
+        return local.expect(predicted.density, self.sensor.at(pose), stand, self.config.view_center(stand), known)
 
     def near(
         self, local: LocalFilter, predicted: Mixture, expected: Expected, look: Look, log_odds: Array
@@ -87,15 +88,16 @@ class Sight:
             look: the scan.
             log_odds: of the tracks to exist, shape (T,).
         """
-        near = local.near(expected, look.plots, self.sensor, look.position)
+        sensor, stand = self.sensor.at(look.pose), look.pose.position
+        near = local.near(expected, look.plots, sensor, stand)
         if look.plots.z.ndim > 2 or not (self.sharing or (self.joint and len(log_odds) > 1)):
             return near, None
         plots, odds = len(look.plots.z), self._told(log_odds)
-        shared, left = local.shared(predicted, expected, near, plots, self.sensor, look.position, expit(odds))
+        shared, left = local.shared(predicted, expected, near, plots, sensor, stand, expit(odds))
         if self.clutter is not None and self.claimed is not None:
             # What stands still begins like a target and has evidence like one (theory.md §13).
             doubted, target = expit(odds - DOUBT), self._moving(predicted)
-            _, known = local.shared(predicted, expected, near, plots, self.sensor, look.position, doubted, target)
+            _, known = local.shared(predicted, expected, near, plots, sensor, stand, doubted, target)
             left = left._replace(false=known.false)
         return shared if self.joint else near, left
 
@@ -120,7 +122,7 @@ class Sight:
     ) -> Mixture:
         """Tracks after a scan; arguments as for ``near``."""
         near, _ = self.near(local, predicted, expected, look, log_odds)
-        return local.update(predicted, expected, near, self.sensor, look.position)
+        return local.update(predicted, expected, near, self.sensor.at(look.pose), look.pose.position)
 
     def look(
         self, local: LocalFilter, tracks: Tracks, predicted: Mixture, expected: Expected, look: Look
@@ -132,25 +134,26 @@ class Sight:
             plots, None: not asked for.
         """
         near, left = self.near(local, predicted, expected, look, tracks.log_odds)
-        visible = tracks.visible
+        visible, sensor, stand = tracks.visible, self.sensor.at(look.pose), look.pose.position
         if self.sensor.visibility is not None:
             v, visible = visible[:, self.number], visible.copy()
-            visible[:, self.number] = local.visible(v, predicted, expected, near, self.sensor, look.position)
-        return local.update(predicted, expected, near, self.sensor, look.position), visible, left
+            visible[:, self.number] = local.visible(v, predicted, expected, near, sensor, stand)
+        return local.update(predicted, expected, near, sensor, stand), visible, left
 
     def mapped(self, seen: ClutterMap | None, look: Look) -> Look:
         """A scan with the density of false plots that earlier scans tell of."""
         if self.clutter is None or seen is None or look.plots.z.ndim > 2:
             return look
-        relative = clutter_map.log_relative(seen, self.clutter, look.plots.z, look.position)
+        relative = clutter_map.log_relative(seen, self.clutter, look.plots.z, look.pose.position)
         return look._replace(plots=look.plots._replace(log_relative=relative))
 
     def learned(self, seen: ClutterMap | None, look: Look, left: Left | None) -> ClutterMap | None:
         """The map of false plots after a scan."""
         if self.clutter is None or seen is None or left is None:
             return seen
-        center = self.config.view_center(look.position)
-        return clutter_map.learn(seen, self.clutter, look.plots.z, left.false, look.time_ns, look.position, center)
+        stand, turned = look.pose.position, self.sensor.at(look.pose).field_of_view != self.sensor.field_of_view
+        center, heading = self.config.view_center(stand), look.pose.heading if turned else 0.0
+        return clutter_map.learn(seen, self.clutter, look.plots.z, left.false, look.time_ns, stand, center, heading)
 
     def unclaimed(self, look: Look, left: Left | None) -> tuple[Look, Array]:
         """The scan with what the tracks leave to later ones, and its plots from which tracks may start."""

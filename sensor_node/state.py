@@ -12,6 +12,7 @@ from common.estimation.batch import put
 from common.estimation.clutter_map import ClutterMap
 from common.estimation.gaussian import Array, BoolArray
 from common.estimation.mixture import Mixture
+from common.estimation.pose import SensorPose
 from common.messages import Advice, Begin, IntArray, Rebase
 
 
@@ -51,7 +52,7 @@ class Ready(NamedTuple):
 
     Attributes:
         tracks, advice: of the state that it was worked out from; it is of use as long as these are the same.
-        time_ns, position, number: of the scan.
+        time_ns, pose, number: of the scan.
         advised: all tracks, advice followed.
         live: which of them started before the scan.
         predicted: those, at the time of the scan.
@@ -62,7 +63,7 @@ class Ready(NamedTuple):
     tracks: Tracks
     advice: tuple[Advice, ...]
     time_ns: int
-    position: Array
+    pose: SensorPose
     number: int
     advised: Tracks
     live: BoolArray
@@ -70,11 +71,11 @@ class Ready(NamedTuple):
     mixture: Mixture
     expected: Expected
 
-    def fits(self, state: State, time_ns: int, position: Array, number: int) -> bool:
+    def fits(self, state: State, time_ns: int, pose: SensorPose, number: int) -> bool:
         """Whether it was worked out from the tracks and advice of a state, for the scan of that time and sensor."""
         same_state = self.tracks is state.tracks and self.advice is state.advice
         same_scan = self.time_ns == time_ns and self.number == number
-        return same_state and same_scan and np.array_equal(self.position, position)
+        return same_state and same_scan and self.pose.equals(pose)
 
 
 class Look(NamedTuple):
@@ -82,7 +83,7 @@ class Look(NamedTuple):
 
     Attributes:
         time_ns: of the scan.
-        position: where the sensor stood [m], shape (d,).
+        pose: of the sensor.
         plots: that all tracks share, with the density of false ones as the map had it then; in a study, where all
             tracks start together, of every track its own.
         number: of the sensor in the scenario.
@@ -90,7 +91,7 @@ class Look(NamedTuple):
     """
 
     time_ns: int
-    position: Array
+    pose: SensorPose
     plots: Plots
     number: int
     log_free: Array | None = None

@@ -17,6 +17,7 @@ from common.estimation.association import Expected, Plots
 from common.estimation.batch import concatenate, take
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp
 from common.estimation.mixture import Mixture
+from common.estimation.pose import SensorPose
 from common.estimation.representation import globalise, shrink
 from common.estimation.selection import Selection, select
 from common.local_filter import SUREST, LocalFilter
@@ -95,21 +96,21 @@ class LocalTracker:
         )
         return State(epoch=0, sequence=0, tracks=self._fresh(start), recent=(), maps=maps)
 
-    def prepare(self, state: State, time_ns: int, position: Array) -> State:
-        """Work out ahead what the next scan will need: its time and the place of the sensor must be known, no more."""
+    def prepare(self, state: State, time_ns: int, pose: SensorPose) -> State:
+        """Work out ahead what the next scan will need: its time and the pose of the sensor must be known, no more."""
         state = self._rebased(state, time_ns)
-        return state._replace(ready=self._ready(state, time_ns, position, self.number))
+        return state._replace(ready=self._ready(state, time_ns, pose, self.number))
 
     def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report | Picked]:
         """Filter one scan and report every track that started before it."""
         number = next(sight.number for sight in self.sights if sight.config.name == scan.sensor)
-        return self.look(state, Look(scan.time_ns, scan.position, Plots(scan.z), number), next_ns)
+        return self.look(state, Look(scan.time_ns, scan.pose, Plots(scan.z), number), next_ns)
 
     def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""
         sight, state = self.sights[look.number], self._rebased(state, look.time_ns)
         look = sight.mapped(state.maps[look.number], look)
-        ready = self._ready(state, look.time_ns, look.position, look.number)
+        ready = self._ready(state, look.time_ns, look.pose, look.number)
         mixture, visible, rest = sight.look(self.filter, ready.predicted, ready.mixture, ready.expected, look)
         filtered = self._with(ready.predicted, mixture)._replace(visible=visible)
         maps = tuple(
@@ -149,12 +150,14 @@ class LocalTracker:
             time_ns=look.time_ns,
             next_ns=next_ns,
             epoch=state.epoch,
-            position=look.position,
+            position=look.pose.position,
             ids=ready.predicted.ids,
             plots=mine.sum(axis=-1),
             which=which,
             z=z,
             unclaimed=unclaimed,
+            velocity=look.pose.velocity,
+            heading=look.pose.heading,
         )
 
     def _report(
@@ -165,6 +168,7 @@ class LocalTracker:
         x, P = (array[0][there] for array in mixture.density)
         if self.rounded:
             x, P = x.astype(np.float32).astype(np.float64), P.astype(np.float32).astype(np.float64)
+        pose = look.pose if self.sights[look.number].claimed is not None else SensorPose(np.empty(0))
         return Report(
             sensor=self.sights[look.number].config.name,
             sequence=state.sequence,
@@ -176,8 +180,10 @@ class LocalTracker:
             log_g=mixture.log_g[there],
             x=x,
             P=P,
-            position=look.position if self.sights[look.number].claimed is not None else np.empty(0),
+            position=pose.position,
             unclaimed=unclaimed,
+            velocity=pose.velocity,
+            heading=pose.heading,
         )
 
     def told(self, state: State, message: Start | Begin | Stop | Advice | Rebase) -> State:
@@ -241,7 +247,7 @@ class LocalTracker:
         for look in state.recent if alone else map(left, state.recent):
             due = fresh.times_ns < look.time_ns
             if due.any():
-                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.position, look.number)
+                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.pose, look.number)
                 mixture, visible, _ = self.sights[look.number].look(self.filter, predicted, mixture, expected, look)
                 fresh = put_tracks(fresh, due, self._with(predicted, mixture)._replace(visible=visible))
         tracks = concatenate(*alike(state.tracks, fresh))
@@ -256,17 +262,17 @@ class LocalTracker:
         """Keep advice for the next scan after its time (theory.md §6)."""
         return state._replace(advice=(*state.advice, advice))
 
-    def _ready(self, state: State, time_ns: int, position: Array, number: int) -> Ready:
+    def _ready(self, state: State, time_ns: int, pose: SensorPose, number: int) -> Ready:
         """What the scan of a time needs: as it was prepared, where that still holds."""
         ready = state.ready
-        if ready is not None and ready.fits(state, time_ns, position, number):
+        if ready is not None and ready.fits(state, time_ns, pose, number):
             return ready
         advised = self._follow_advice(state, time_ns)
         # Another sensor may have scanned at this very time.
         again = bool(state.recent) and state.recent[-1].time_ns == time_ns
         live = advised.times_ns < time_ns + again
-        moving = self._expect(take(advised, live), time_ns, position, number)
-        return Ready(state.tracks, state.advice, time_ns, position, number, advised, live, *moving)
+        moving = self._expect(take(advised, live), time_ns, pose, number)
+        return Ready(state.tracks, state.advice, time_ns, pose, number, advised, live, *moving)
 
     def _follow_advice(self, state: State, t_ns: int) -> Tracks:
         """Set the association filters to the newest fused tracks from before ``t_ns`` and redo the scans since.
@@ -290,7 +296,7 @@ class LocalTracker:
                 prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
                 predicted = honest.predict(prior, _interval(times[due], look.time_ns))
                 sight, visible = self.sights[look.number], tracks.visible[due, look.number]
-                expected = sight.expect(honest, predicted, look.position, visible)
+                expected = sight.expect(honest, predicted, look.pose, visible)
                 filtered = sight.filter(honest, predicted, expected, look, tracks.log_odds[due])
                 log_w[due], _, ((x_a[due],), (P_a[due],)) = filtered
                 times[due] = look.time_ns
@@ -319,13 +325,13 @@ class LocalTracker:
             network_P=network_P,
         )
 
-    def _expect(self, tracks: Tracks, time_ns: int, position: Array, number: int) -> tuple[Tracks, Mixture, Expected]:
-        """Predict to a time, and what a sensor will see from a position then."""
+    def _expect(self, tracks: Tracks, time_ns: int, pose: SensorPose, number: int) -> tuple[Tracks, Mixture, Expected]:
+        """Predict to a time, and what a sensor at a pose will see then."""
         mixture, network_P = self._predict(tracks, time_ns)
         now = np.full_like(tracks.times_ns, time_ns)
         visible = self._still_visible(tracks.visible, (time_ns - tracks.times_ns) / NS_PER_S)
         predicted = tracks._replace(times_ns=now, times_a_ns=now, visible=visible, network_P=network_P)
-        expected = self.sights[number].expect(self.filter, mixture, position, visible[:, number])
+        expected = self.sights[number].expect(self.filter, mixture, pose, visible[:, number])
         return self._with(predicted, mixture), mixture, expected
 
     def _still_visible(self, visible: Array, dt: Array) -> Array:

@@ -46,10 +46,11 @@ class _Solo:
         """Filter a scan."""
         config, sensor = self._sensors[look.sensor]
         self.predict(look.time_ns)
-        center = config.view_center(look.stand)
-        expected = self._filter.expect(self.mixture.density, sensor, look.stand, center)
-        near = self._filter.near(expected, own(look.plots), sensor, look.stand)
-        self.mixture = self._filter.update(self.mixture, expected, near, sensor, look.stand)
+        sensor, stand = sensor.at(look.pose), look.pose.position
+        center = config.view_center(stand)
+        expected = self._filter.expect(self.mixture.density, sensor, stand, center)
+        near = self._filter.near(expected, own(look.plots), sensor, stand)
+        self.mixture = self._filter.update(self.mixture, expected, near, sensor, stand)
 
     def predict(self, time_ns: int) -> None:
         """Go on to a time."""
@@ -143,5 +144,5 @@ def _ending(looks: tuple[Look, ...]) -> list[tuple[Look, bool]]:
 def _bytes(look: Look) -> float:
     """Mean size of a scan's message."""
     most, m = look.plots.z.shape[1:]
-    empty, full = (len(encode(Scan("", look.time_ns, look.stand, np.zeros((count, m))))) for count in (0, most))
+    empty, full = (len(encode(Scan("", look.time_ns, look.pose.position, np.zeros((count, m))))) for count in (0, most))
     return float(empty + (full - empty) * look.counts.mean() / max(most, 1))

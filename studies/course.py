@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 from common.estimation.association import Plots
 from common.estimation.gaussian import Array
+from common.estimation.pose import SensorPose
 from common.messages import IntArray
 
 
@@ -15,14 +16,14 @@ class Look(NamedTuple):
     Attributes:
         time_ns: of the scan.
         sensor: number of the sensor.
-        stand: where it stood [m], shape (d,).
+        pose: of it.
         plots: z of shape (R, M, m), padded; valid of shape (R, M).
         counts: plots of each world, shape (R,).
     """
 
     time_ns: int
     sensor: int
-    stand: Array
+    pose: SensorPose
     plots: Plots
     counts: IntArray
 

@@ -73,7 +73,7 @@ class _Network:
         x, P, log_lr, up = [], [], [], 0
         for i, look in enumerate(looks):
             tracker, node = self._trackers[look.sensor], self._nodes[look.sensor]
-            scan = NodeLook(look.time_ns, look.stand, own(look.plots), look.sensor)
+            scan = NodeLook(look.time_ns, look.pose, own(look.plots), look.sensor)
             self._nodes[look.sensor], report = tracker.look(node, scan, self._next_ns(look.sensor, i))
             up += len(encode(report, rounded=tracker.rounded))
             self._tell(report)

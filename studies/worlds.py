@@ -69,4 +69,4 @@ def _look(scenario: Scenario, scans: Sequence[Scan]) -> Look:
         row[: len(scan.z)] = scan.z
     valid = np.arange(z.shape[1]) < counts[:, None]
     number = scenario.sensor_names.index(scans[0].sensor)
-    return Look(scans[0].time_ns, number, scans[0].position, Plots(z, valid), counts)
+    return Look(scans[0].time_ns, number, scans[0].pose, Plots(z, valid), counts)

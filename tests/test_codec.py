@@ -68,6 +68,11 @@ def with_unclaimed(message: Any, plots: int, m: int = 2, d: int = 2) -> Any:
     return message._replace(position=rng.standard_normal(d), unclaimed=rng.standard_normal((plots, m)))
 
 
+def moving(message: Any, d: int = 2) -> Any:
+    """A message of a sensor that moves and is turned."""
+    return message._replace(velocity=np.arange(1.0, d + 1.0), heading=-0.5)
+
+
 def start(tracks: int, n: int = 4) -> Start:
     rng = np.random.default_rng(tracks)
     return Start(
@@ -172,6 +177,13 @@ MESSAGES: dict[str, Message] = {
     "picked-unclaimed-3d": with_unclaimed(picked(2, 3, m=3), 2, m=3, d=3),
     **{f"scan-{m}": scan(m) for m in (0, 1, 100)},
     "scan-3d": scan(2, d=3),
+    "scan-moving": moving(scan(1)),
+    "scan-moving-3d": moving(scan(2, d=3), 3),
+    "scan-at-rest": scan(1)._replace(velocity=np.zeros(2)),
+    "scan-turned": scan(1)._replace(heading=6.25),
+    "report-moving": moving(with_unclaimed(report(1), 1)),
+    "report-turned-without-place": report(1)._replace(heading=0.25),
+    "picked-moving": moving(with_unclaimed(picked(1, 3), 1)),
     "join": Join("radar-1", 2**63 - 1, EPOCH_NS, "0123456789abcdef"),
     "join-never": Join("radar-1", 0, NEVER, ""),
     **{f"start-{t}": start(t) for t in (0, 1, 100)},
@@ -209,8 +221,14 @@ def refusal(payload: bytes, key: str | None = None) -> str:
 
 def altered(message: Message, **changes: Any) -> bytes:
     """A message whose envelope was tampered with."""
-    parts = dict(zip(("version", "kind", "scalars", "sizes", "blocks"), msgpack.unpackb(encode(message)), strict=True))
+    names = ("version", "kind", "scalars", "sizes", "blocks", "pose")
+    parts = dict(zip(names, msgpack.unpackb(encode(message)), strict=False))
     return msgpack.packb(list({**parts, **changes}.values()))
+
+
+def with_pose(message: Message, pose: Any) -> bytes:
+    """A message with a sixth element."""
+    return msgpack.packb([*msgpack.unpackb(encode(message)), pose])
 
 
 @each_message
@@ -366,6 +384,36 @@ GOLDEN = [
 ]
 
 
+#: Velocity and heading stand behind the bytes of a message of a sensor that stands still and heads north.
+GOLDEN_MOVING = [
+    (
+        Scan("a", 10, np.array([5.0, 0.0]), np.array([[1.0]]), np.array([2.0, -4.0]), 0.5),
+        "96 03 02 91 0a 93 02 01 01"  # version, kind, time, d, M, m
+        "c4 18 0000000000001440 0000000000000000 000000000000f03f"  # bin; position, z
+        "c4 18 0000000000000040 00000000000010c0 000000000000e03f",  # bin; velocity, heading
+    ),
+    (
+        Scan("a", 10, np.array([5.0, 0.0]), np.array([[1.0]]), heading=0.5),
+        "96 03 02 91 0a 93 02 01 01 c4 18 0000000000001440 0000000000000000 000000000000f03f"
+        "c4 08 000000000000e03f",  # bin; heading
+    ),
+]
+
+
+@pytest.mark.parametrize(("message", "golden"), GOLDEN_MOVING, ids=["moving", "turned"])
+def test_the_bytes_of_a_sensor_that_moves_never_change(message: Message, golden: str) -> None:
+    payload = bytes.fromhex(golden)
+    assert encode(message) == payload
+    assert same(decode(KEYS.of(message), payload), message)
+
+
+def test_a_pose_adds_itself_to_the_bytes_and_nothing_else() -> None:
+    for still in (scan(3), with_unclaimed(report(2), 1), picked(2, 3)):
+        before, after = (msgpack.unpackb(encode(message)) for message in (still, moving(still)))
+        assert after[:5] == before
+        assert len(after[5]) == 24
+
+
 GOLDEN_ROUNDED = [
     (
         GOLDEN_UNCLAIMED,
@@ -512,9 +560,9 @@ def floats(message: Message) -> list[str]:
 FLOATS = [
     (message, name)
     for message in (
-        with_unclaimed(report(1), 1),
-        with_unclaimed(picked(1, 1), 1),
-        scan(1),
+        moving(with_unclaimed(report(1), 1)),
+        moving(with_unclaimed(picked(1, 1), 1)),
+        moving(scan(1)),
         start(1),
         begin(1),
         advice(1),
@@ -522,6 +570,7 @@ FLOATS = [
         picture(1),
     )
     for name in floats(message)
+    if name != "heading"
 ]
 FLOAT_NAMES = [f"{type(message).__name__}.{name}" for message, name in FLOATS]
 
@@ -553,6 +602,12 @@ def test_scalars_that_are_nan_are_refused(message: Message, name: str) -> None:
     assert name in refusal(encode(message._replace(**{name: float("nan")})), KEYS.of(message))
 
 
+@pytest.mark.parametrize("message", [moving(scan(1)), moving(with_unclaimed(report(1), 1)), moving(picked(1, 1))])
+def test_a_heading_that_is_nan_is_refused(message: Any) -> None:
+    payload = encode(message._replace(heading=float("nan")))
+    assert "heading is nan, expected a finite float" in refusal(payload, KEYS.of(message))
+
+
 BLOCKS = msgpack.unpackb(encode(GOLDEN_REPORT))[4]
 ENVELOPES = [
     ("nothing", b"", "not msgpack"),
@@ -563,7 +618,16 @@ ENVELOPES = [
     ("version as text", msgpack.packb(["1"]), "expected an array that starts with the version"),
     ("version as truth", msgpack.packb([True]), "expected an array that starts with the version"),
     ("too short", msgpack.packb([VERSION, 1]), "2 elements, expected 5: version, kind, scalars, sizes, blocks"),
-    ("too long", msgpack.packb([VERSION, 1, [], [], b"", 0]), "6 elements, expected 5"),
+    ("too long", msgpack.packb([VERSION, 1, [], [], b"", b"", 0]), "7 elements, expected 5"),
+    (
+        "a pose that is no bin",
+        with_pose(GOLDEN_UNCLAIMED, 0.5),
+        "heading are 0.5, expected a bin of 8 or",
+    ),
+    ("a pose of 3-D", with_pose(GOLDEN_UNCLAIMED, bytes(32)), "expected a bin of 8 or 24 bytes"),
+    ("a pose of nothing", with_pose(GOLDEN_UNCLAIMED, b""), "velocity and heading are b'', expected a bin of 8 or 24"),
+    ("a velocity of no place", with_pose(GOLDEN_REPORT, bytes(24)), "expected a bin of 8 bytes"),
+    ("a pose of no sensor", with_pose(MESSAGES["tracks-1"], bytes(8)), "a Tracks has 5 elements, not 6"),
     ("kind unknown", altered(GOLDEN_REPORT, kind=99), "kind 99 is unknown"),
     ("kind as truth", altered(GOLDEN_REPORT, kind=True), "kind True is unknown"),
     ("scalars missing", altered(GOLDEN_REPORT, scalars=[1, 2]), "expected the 4 scalars of a Report"),

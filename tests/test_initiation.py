@@ -10,6 +10,7 @@ from builders import Node, Stage, live_as_replayed, only, scenario, sensor_table
 
 from common.config import Scenario
 from common.estimation.gaussian import Gaussian
+from common.estimation.pose import SensorPose
 from common.messages import NEVER, Begin, Decision, Join, Message, Report, Scan, Start, Stop, Tracks
 from fusion_center.initiation import Initiation, Unclaimed
 from fusion_center.picture import Picture
@@ -32,7 +33,9 @@ def initiation_of(plot: Scenario) -> Initiation:
 
 def seen(z: list[list[float]], number: int = 0, time_s: float = 2.0, ids: list[int] | None = None) -> Unclaimed:
     known = np.array(ids or [], np.int64)
-    return Unclaimed(round(time_s * 1e9), number, np.array([3000.0, 0.0]), known, np.array(z).reshape(-1, 2))
+    return Unclaimed(
+        round(time_s * 1e9), number, SensorPose(np.array([3000.0, 0.0])), known, np.array(z).reshape(-1, 2)
+    )
 
 
 def picture(plot: Scenario, places: list[list[float]], sigma: float = 20.0, **fields: Any) -> Picture:

@@ -140,7 +140,7 @@ BAD = [
     ({"sensor": "a", "time": 2.0}, "plots is missing"),
     ({"sensor": "a", "plots": []}, "time is missing"),
     ({"time": 2.0, "plots": []}, "sensor is missing"),
-    ({**LINE, "plot": []}, "'plot' is no known key; expected plots, position, sensor, time"),
+    ({**LINE, "plot": []}, "'plot' is no known key; expected heading, plots, position, sensor, time, velocity"),
     ({**LINE, "sensor": "c"}, "sensor: 'c' is not one of a, b"),
     ({**LINE, "sensor": 1}, "sensor: 1 is not one of a, b"),
     ({**LINE, "sensor": ["a"]}, "sensor: ['a'] is not one of a, b"),

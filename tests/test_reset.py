@@ -14,6 +14,7 @@ from reference import Density, folded
 
 from common.codec import encode
 from common.config import Scenario
+from common.estimation.pose import SensorPose
 from common.memory import MemoryNetwork
 from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Rebase, Report, Scan, Start, Stop, Tracks
 from common.quantities import NS_PER_S
@@ -99,7 +100,7 @@ def followed(node: Node, *rebases: Rebase) -> State:
     state = node.state
     for rebase in rebases:
         state = node.tracker.rebase(state, rebase)
-    return node.tracker.prepare(state, max(rebase.after_ns for rebase in rebases) + 1, np.zeros(2))
+    return node.tracker.prepare(state, max(rebase.after_ns for rebase in rebases) + 1, SensorPose(np.zeros(2)))
 
 
 def seconds(network: Network, scan: Scan) -> float:

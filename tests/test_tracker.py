@@ -201,7 +201,7 @@ def test_a_step_leaves_the_state_before_as_it_was() -> None:
 
 def prepared(keeper: Node, scan: Scan) -> Any:
     """What a node has ready for a scan."""
-    keeper.state = keeper.tracker.prepare(keeper.state, scan.time_ns, scan.position)
+    keeper.state = keeper.tracker.prepare(keeper.state, scan.time_ns, scan.pose)
     return keeper.state.ready
 
 

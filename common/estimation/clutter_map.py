@@ -79,6 +79,7 @@ class ClutterMap(NamedTuple):
         counts: of false plots in them, shape (C,).
         centers: of the fields of view [m], shape (V, d).
         scans: seen from each, shape (V,).
+        headings: that the fields of view are turned to [rad], shape (V,).
     """
 
     time_ns: int
@@ -86,11 +87,12 @@ class ClutterMap(NamedTuple):
     counts: Array
     centers: Array
     scans: Array
+    headings: Array
 
 
 def start(d: int) -> ClutterMap:
     """A map of nothing, in ``d`` dimensions."""
-    return ClutterMap(0, np.empty(0, np.int64), np.empty(0), np.empty((0, d)), np.empty(0))
+    return ClutterMap(0, np.empty(0, np.int64), np.empty(0), np.empty((0, d)), np.empty(0), np.empty(0))
 
 
 def log_relative(seen: ClutterMap, model: ClutterModel, z: Array, stand: Array) -> Array:
@@ -114,13 +116,20 @@ def log_relative(seen: ClutterMap, model: ClutterModel, z: Array, stand: Array) 
     if model.angular(d):
         scans = np.full(len(z), seen.scans.sum())
     else:
-        scans = np.tensordot(seen.scans, np.vecdot(_visible(model, index, seen.centers), share), axes=1)
+        scans = np.tensordot(seen.scans, np.vecdot(_visible(model, index, seen), share), axes=1)
     relative: Array = np.log(model.shape + counts) - np.log(model.shape + model.prior_rate(d) * scans)
     return relative
 
 
 def learn(
-    seen: ClutterMap, model: ClutterModel, z: Array, false: Array, time_ns: int, stand: Array, center: Array
+    seen: ClutterMap,
+    model: ClutterModel,
+    z: Array,
+    false: Array,
+    time_ns: int,
+    stand: Array,
+    center: Array,
+    heading: float = 0.0,
 ) -> ClutterMap:
     """Count the plots of a scan, each as far as it is false, and forget (Eq. 22).
 
@@ -132,6 +141,7 @@ def learn(
         time_ns: of the scan.
         stand: where the sensor stands [m], shape (d,).
         center: of its field of view [m], shape (d,).
+        heading: that this is turned to [rad].
 
     Returns:
         the map with the scan.
@@ -142,10 +152,10 @@ def learn(
     more = np.zeros(len(new))
     np.add.at(more, which, share * false[:, None])
     cells, counts = _added(seen.cells, seen.counts * kept, new, more)
-    centers, scans = _watched(seen, model, kept, center)
+    centers, scans, headings = _watched(seen, model, kept, center, heading)
     there = counts > _FADED * model.shape
     lasting = scans > _FADED
-    return ClutterMap(time_ns, cells[there], counts[there], centers[lasting], scans[lasting])
+    return ClutterMap(time_ns, cells[there], counts[there], centers[lasting], scans[lasting], headings[lasting])
 
 
 def _around(model: ClutterModel, z: Array, stand: Array) -> tuple[IntArray, Array]:
@@ -168,14 +178,18 @@ def _around(model: ClutterModel, z: Array, stand: Array) -> tuple[IntArray, Arra
     return index, share
 
 
-def _visible(model: ClutterModel, index: IntArray, centers: Array) -> Array:
+def _visible(model: ClutterModel, index: IntArray, seen: ClutterMap) -> Array:
     """How much of what counts in a cell is in the field of view from each center, shape (V, M, K)."""
     d = index.shape[-1]
     # A plot that counts in a cell lies within one side of its middle, the probability falling linearly.
     middle: Array = np.asarray((index + 0.5) * model.cell, np.float64)
     places = Gaussian(middle, np.eye(d) * model.cell**2 / 6.0)
-    inside = [model.sensor.field_of_view.probability_inside(places, center) for center in centers]
-    return np.array(inside).reshape(len(centers), *index.shape[:-1])
+    view = model.sensor.field_of_view
+    inside = [
+        view.turned(heading).probability_inside(places, center)
+        for center, heading in zip(seen.centers, seen.headings.tolist(), strict=True)
+    ]
+    return np.array(inside).reshape(len(seen.centers), *index.shape[:-1])
 
 
 def _numbers(index: IntArray) -> IntArray:
@@ -204,13 +218,18 @@ def _added(cells: IntArray, counts: Array, new: IntArray, more: Array) -> tuple[
     return np.insert(cells, at[~known], new[~known]), np.insert(counts, at[~known], more[~known])
 
 
-def _watched(seen: ClutterMap, model: ClutterModel, kept: float, center: Array) -> tuple[Array, Array]:
-    """Where was looked from, and how often: a place less than half a cell off is the same one."""
-    scans = seen.scans * kept
-    near = np.linalg.vector_norm(seen.centers - center, axis=-1) <= 0.5 * model.cell
-    if model.angular(len(center)):
-        near[:] = True
+def _watched(
+    seen: ClutterMap, model: ClutterModel, kept: float, center: Array, heading: float
+) -> tuple[Array, Array, Array]:
+    """From where and which way was looked, and how often: what moves an edge by less than half a cell is the same."""
+    scans, d = seen.scans * kept, len(center)
+    near = np.ones(len(scans), np.bool_)
+    if not model.angular(d):
+        turned = np.abs(np.remainder(seen.headings - heading + np.pi, 2.0 * np.pi) - np.pi)
+        width = model.sensor.field_of_view.volume ** (1.0 / d)
+        near = np.linalg.vector_norm(seen.centers - center, axis=-1) <= 0.5 * model.cell
+        near &= turned * width <= 0.5 * model.cell
     if near.any():
         scans[near.argmax()] += 1.0
-        return seen.centers, scans
-    return np.concatenate([seen.centers, center[None]]), np.append(scans, 1.0)
+        return seen.centers, scans, seen.headings
+    return np.concatenate([seen.centers, center[None]]), np.append(scans, 1.0), np.append(seen.headings, heading)

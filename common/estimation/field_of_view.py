@@ -38,6 +38,10 @@ class FieldOfView(Protocol):
         """Area [m^2] in 2-D, volume [m^3] in 3-D."""
         ...
 
+    def turned(self, heading: float) -> FieldOfView:
+        """The field of view of a platform with this heading [rad], clockwise from north, of one that headed north."""
+        ...
+
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included.
 
@@ -92,6 +96,10 @@ class Everywhere(NamedTuple):
         """Area [m^2] in 2-D, volume [m^3] in 3-D."""
         return self.volume_
 
+    def turned(self, heading: float) -> Everywhere:  # noqa: ARG002
+        """The same: it has no direction."""
+        return self
+
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside: always, shapes (..., d) to (...)."""
         return np.ones(np.broadcast_shapes(z.shape, center.shape)[:-1], dtype=np.bool_)
@@ -122,6 +130,10 @@ class AllAround(NamedTuple):
         """Without bound."""
         return np.inf
 
+    def turned(self, heading: float) -> AllAround:  # noqa: ARG002
+        """The same: it has no direction."""
+        return self
+
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside: always, shapes (..., d) to (...)."""
         return np.ones(np.broadcast_shapes(z.shape, center.shape)[:-1], dtype=np.bool_)
@@ -137,26 +149,35 @@ class AllAround(NamedTuple):
 
 
 class Box(NamedTuple):
-    """A rectangle or cuboid with its sides along the axes.
+    """A rectangle or cuboid with its sides along the axes, or turned.
 
     Attributes:
         size: full lengths of the sides [m], one per dimension.
+        heading: how far it is turned around the vertical [rad], clockwise from north.
     """
 
     size: tuple[float, ...]
+    heading: float = 0.0
 
     @property
     def volume(self) -> float:
         """Area [m^2] in 2-D, volume [m^3] in 3-D."""
         return float(np.prod(self.size))
 
+    def turned(self, heading: float) -> Box:
+        """The box turned further around its center."""
+        return self._replace(heading=self.heading + heading)
+
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included, shapes (..., d) to (...)."""
-        return np.asarray(np.all(np.abs(z - center) <= 0.5 * np.array(self.size), axis=-1))
+        return np.asarray(np.all(np.abs(self._along(z - center)) <= 0.5 * np.array(self.size), axis=-1))
 
     def probability_inside(self, position: Gaussian, center: Array) -> Array:
         """Probability that Gaussian positions lie inside, shapes (..., d), (..., d, d) to (...)."""
         mean, P = _relative(position, center)
+        if self.heading:
+            turn = self._turn()
+            mean, P = mean @ turn.T, turn @ P @ turn.T
         sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
         half = 0.5 * np.array(self.size)
         margin = ((half - np.abs(mean)) / sigma).min(axis=-1)
@@ -170,7 +191,19 @@ class Box(NamedTuple):
 
     def draw(self, rng: np.random.Generator, count: int, center: Array) -> Array:
         """Draw points uniformly inside, shape (count, d)."""
-        return center + np.array(self.size) * rng.uniform(-0.5, 0.5, (count, len(self.size)))
+        points = np.array(self.size) * rng.uniform(-0.5, 0.5, (count, len(self.size)))
+        return center + (points @ self._turn() if self.heading else points)
+
+    def _along(self, offset: Array) -> Array:
+        """Offsets from the center along the sides, shape (..., d)."""
+        return offset @ self._turn().T if self.heading else offset
+
+    def _turn(self) -> Array:
+        """Rotation of (east, north(, up)) into the frame of the sides, shape (d, d)."""
+        sine, cosine = np.sin(self.heading), np.cos(self.heading)
+        turn = np.eye(len(self.size))
+        turn[:2, :2] = [[cosine, -sine], [sine, cosine]]
+        return turn
 
 
 class Disc(NamedTuple):
@@ -189,6 +222,10 @@ class Disc(NamedTuple):
         """Area [m^2] in 2-D, volume [m^3] in 3-D."""
         d = self.dimensions
         return float(np.pi ** (d / 2) / gamma(d / 2 + 1) * self.radius**d)
+
+    def turned(self, heading: float) -> Disc:  # noqa: ARG002
+        """The same: it is round."""
+        return self
 
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included, shapes (..., d) to (...)."""

@@ -43,6 +43,10 @@ class Polar(NamedTuple):
         """Which numbers of a plot are angles around a circle."""
         return (1,)
 
+    def moving(self, velocity: Array) -> Polar:  # noqa: ARG002
+        """The same: range and direction do not depend on how the sensor moves."""
+        return self
+
     def observe(self, x: Array, origin: Array) -> Array:
         """The plot of states ``x`` without noise, seen from ``origin``, shapes (..., n), (d,) to (..., m)."""
         return to_polar(x[..., : len(self.sigma)] - origin)
@@ -80,17 +84,19 @@ class Polar(NamedTuple):
 
 
 class PolarDoppler(NamedTuple):
-    """A sensor of range, azimuth(, elevation), and range rate.
+    """A sensor of range, azimuth(, elevation), and range rate relative to itself.
 
     Attributes:
         sigma: standard deviations [m, rad(, rad), m/s].
         n: size of the state.
         max_speed: false plots have range rates uniform up to it, approaching and receding [m/s].
+        velocity: of the sensor over ground [m/s], which range rates are relative to; default: it stands still.
     """
 
     sigma: tuple[float, ...]
     n: int
     max_speed: float
+    velocity: tuple[float, ...] = ()
 
     @property
     def m(self) -> int:
@@ -107,18 +113,26 @@ class PolarDoppler(NamedTuple):
         return Polar(self.sigma[:-1], self.n)
 
     @property
+    def _own(self) -> Array:
+        return np.array(self.velocity or 0.0)
+
+    def moving(self, velocity: Array) -> PolarDoppler:
+        """The measurement of a sensor that moves with a velocity over ground [m/s], shape (d,)."""
+        return self._replace(velocity=tuple(velocity.tolist()))
+
+    @property
     def angular(self) -> tuple[int, ...]:
         """Which numbers of a plot are angles around a circle."""
         return (1,)
 
     def observe(self, x: Array, origin: Array) -> Array:
         """The plot of states ``x`` without noise, seen from ``origin``, shapes (..., n), (d,) to (..., m)."""
-        polar, rate = self._polar.observe(x, origin), radial_speed(x, origin)
+        polar, rate = self._polar.observe(x, origin), radial_speed(x, origin, self._own)
         return np.concatenate([polar, rate[..., None]], axis=-1)
 
     def linearise(self, density: Gaussian, origin: Array) -> Linearised:
         """Expected plot, Jacobian and noise where states are distributed as ``density``, seen from ``origin``."""
-        polar, rate = self._polar.linearise(density, origin), approach(density, origin)
+        polar, rate = self._polar.linearise(density, origin), approach(density, origin, self._own)
         R = np.zeros((*rate.speed.shape, self.m, self.m))
         R[..., :-1, :-1], R[..., -1, -1] = polar.R, rate.rest + self.sigma[-1] ** 2
         z = np.concatenate([polar.z, rate.speed[..., None]], axis=-1)
@@ -174,6 +188,10 @@ class Bearing(NamedTuple):
     def angular(self) -> tuple[int, ...]:
         """Which numbers of a plot are angles around a circle."""
         return (0,)
+
+    def moving(self, velocity: Array) -> Bearing:  # noqa: ARG002
+        """The same: a direction does not depend on how the sensor moves."""
+        return self
 
     def observe(self, x: Array, origin: Array) -> Array:
         """The plot of states ``x`` without noise, seen from ``origin``, shapes (..., n), (d,) to (..., m)."""

@@ -59,6 +59,10 @@ class Sector(NamedTuple):
         d = self.dimensions
         return self.directions * (self.radius**d - self.inner**d) / d
 
+    def turned(self, heading: float) -> Sector:
+        """The sector with its middle turned by the heading of its platform [rad], clockwise."""
+        return self._replace(direction=self.direction + heading)
+
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included, shapes (..., d) to (...)."""
         offset = z - center

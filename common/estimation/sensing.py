@@ -9,6 +9,7 @@ import numpy as np
 from common.estimation.detection import Constant, Detection, Notch
 from common.estimation.field_of_view import FieldOfView
 from common.estimation.gaussian import Array, BoolArray, Gaussian
+from common.estimation.pose import SensorPose
 from common.estimation.visibility import Visibility
 
 
@@ -44,6 +45,10 @@ class Measurement(Protocol):
     @property
     def angular(self) -> tuple[int, ...]:
         """Which numbers of a plot are angles around a circle."""
+        ...
+
+    def moving(self, velocity: Array) -> Measurement:
+        """The measurement of a sensor that moves with a velocity over ground [m/s], shape (d,)."""
         ...
 
     def observe(self, x: Array, origin: Array) -> Array:
@@ -110,6 +115,10 @@ class Position(NamedTuple):
         """Which numbers of a plot are angles around a circle: none."""
         return ()
 
+    def moving(self, velocity: Array) -> Position:  # noqa: ARG002
+        """The same: a position does not depend on how the sensor moves."""
+        return self
+
     def observe(self, x: Array, origin: Array) -> Array:  # noqa: ARG002 (a position is seen from anywhere)
         """The position of states ``x``, shape (..., n) to (..., m)."""
         return x[..., : self.m]
@@ -149,6 +158,7 @@ class Sensor(NamedTuple):
         field_of_view: where it sees.
         detection: how the detection probability depends on the target's state.
         visibility: how long it loses targets; None: it does not.
+        fixed_view: the field of view does not turn with the sensor.
     """
 
     measurement: Measurement
@@ -157,6 +167,14 @@ class Sensor(NamedTuple):
     field_of_view: FieldOfView
     detection: Detection = Constant()
     visibility: Visibility | None = None
+    fixed_view: bool = False
+
+    def at(self, pose: SensorPose) -> Sensor:
+        """The model for a scan at a pose: its range rates are relative to the sensor, its field of view is turned."""
+        if not pose.velocity.any() and pose.heading == 0.0:
+            return self
+        view = self.field_of_view if self.fixed_view else self.field_of_view.turned(pose.heading)
+        return self._replace(measurement=self.measurement.moving(pose.velocity), field_of_view=view)
 
     @property
     def log_rho_f(self) -> float:

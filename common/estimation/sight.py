@@ -21,6 +21,8 @@ from common.estimation.gaussian import Array, Gaussian
 _ANY_AZIMUTH, _ANY_ELEVATION = np.pi**2 / 3.0, np.pi**2 / 12.0
 #: Shortest distance that is divided by [m].
 _SHORTEST = 1e-9
+#: Velocity of an observer that stands still, in any dimensions [m/s].
+_AT_REST = np.zeros(())
 
 
 class Look(NamedTuple):
@@ -69,18 +71,27 @@ def to_cartesian(polar: Array) -> Array:
     return np.stack([ground * np.sin(azimuth), ground * np.cos(azimuth), r * np.sin(polar[..., 2])], axis=-1)
 
 
-def radial_speed(x: Array, origin: Array) -> Array:
-    """Speed of states away from ``origin`` [m/s], shapes (..., n), (d,) to (...); 0 at the origin itself."""
+def radial_speed(x: Array, origin: Array, velocity: Array = _AT_REST) -> Array:
+    """Speed of states away from ``origin`` [m/s], ``u . (v - velocity)``, 0 at the origin itself.
+
+    Args:
+        x: states, shape (..., n).
+        origin: [m], shape (d,).
+        velocity: of an observer at the origin [m/s], shape (d,); default: over ground.
+
+    Returns:
+        shape (...).
+    """
     d = origin.shape[-1]
     offset = x[..., :d] - origin
     distance = np.maximum(np.linalg.vector_norm(offset, axis=-1), _SHORTEST)
-    return np.asarray(np.vecdot(offset, x[..., d : 2 * d]) / distance)
+    return np.asarray(np.vecdot(offset, x[..., d : 2 * d] - velocity) / distance)
 
 
-def approach(density: Gaussian, origin: Array) -> Approach:
-    """``radial_speed`` linearised at the means, shapes (..., n), (..., n, n), (d,)."""
+def approach(density: Gaussian, origin: Array, velocity: Array = _AT_REST) -> Approach:
+    """``radial_speed`` linearised at the means, shapes (..., n), (..., n, n), (d,), (d,)."""
     d, (x, P) = origin.shape[-1], density
-    look, v = look_at(density, origin), x[..., d : 2 * d]
+    look, v = look_at(density, origin), x[..., d : 2 * d] - velocity
     speed = np.vecdot(look.direction, v)
     slope = np.zeros_like(x)
     slope[..., :d] = (v - speed[..., None] * look.direction) / look.reach[..., None]

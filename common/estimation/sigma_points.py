@@ -39,6 +39,10 @@ class SigmaPoint(NamedTuple):
         """Which numbers of a plot are angles around a circle."""
         return self.measurement.angular
 
+    def moving(self, velocity: Array) -> SigmaPoint:
+        """The measurement of a sensor that moves with a velocity over ground [m/s], shape (d,)."""
+        return self._replace(measurement=self.measurement.moving(velocity))
+
     def observe(self, x: Array, origin: Array) -> Array:
         """The plot of states ``x`` without noise, seen from ``origin``, shapes (..., n), (d,) to (..., m)."""
         return self.measurement.observe(x, origin)

@@ -140,6 +140,10 @@ _KEYED = (Report, Picked, Scan, Join, Start, Stop)
 #: Messages that have a velocity and a heading, which are sent where they are not zero.
 _POSED = (Report, Picked, Scan)
 _POSE = ("velocity", "heading")
+#: Scalars at the end of a message that are left out where all of them are zero.
+_OPTIONAL: dict[type, int] = {Join: 2}
+#: Ids and epochs that a center could not count on from.
+_MAX_ID, _MAX_EPOCH = 2**31, 2**62
 
 _TO_WIRE: dict[str, Callable[[Any], Any]] = {"int": int, "float": float, "str": str, "tuple": list}
 _EXPECTED = {"int": "a 64-bit integer", "float": "a finite float", "str": "a text", "tuple": "an array of texts"}
@@ -174,6 +178,9 @@ def encode(message: Message, *, rounded: bool = False) -> bytes:
         assert wire.dtype.kind != "u" or (wire == array).all(), f"{block.field} does not fit into {block.dtype}"
         raw.append(wire.tobytes())
     scalars = [_TO_WIRE[hint](getattr(message, name)) for name, hint in _scalars(kind)]
+    optional = _OPTIONAL.get(type(message), 0)
+    if optional and not any(scalars[-optional:]):
+        del scalars[-optional:]
     return bytes(msgpack.packb([VERSION, kind, scalars, list(sizes.values()), b"".join(raw), *_pose(message)]))
 
 
@@ -236,6 +243,8 @@ def _decode_body(sensor: str, body: list[Any]) -> Message:
 
 
 def _decode_scalars(message: type, expected: tuple[tuple[str, str], ...], scalars: Any) -> dict[str, Any]:
+    if isinstance(scalars, list) and len(scalars) == len(expected) - _OPTIONAL.get(message, 0):
+        expected = expected[: len(scalars)]
     if not isinstance(scalars, list) or len(scalars) != len(expected):
         raise DecodeError(f"expected the {len(expected)} scalars of a {message.__name__}")
     fields: dict[str, Any] = {}
@@ -341,6 +350,8 @@ def _check_numbers(message: Message) -> None:
 def _check_counts(message: Message) -> None:
     """Counts that must agree, numbers that must stand for something."""
     match message:
+        case Join(epoch=epoch, next_id=next_id) if not (0 <= epoch < _MAX_EPOCH and 0 <= next_id < _MAX_ID):
+            raise DecodeError(f"epoch {epoch} or next_id {next_id} is none that a center could count on from")
         case Report(terms=terms, log_g=log_g) if (terms < 1).any() or terms.sum() != len(log_g):
             raise DecodeError(f"{int(terms.sum())} terms of tracks, {len(log_g)} terms sent")
         case Picked(plots=plots, which=which, z=z) if plots.sum() != len(which) or (which >= len(z)).any():

@@ -138,12 +138,16 @@ class Join(NamedTuple):
         incarnation: random number of the process: a restarted node has lost its factors, a reconnected one has not.
         next_ns: no report of this sensor will be about an earlier time.
         digest: of the scenario, which must be the center's.
+        epoch: the newest that the node has heard of, from this or an earlier center; a new center goes on above it.
+        next_id: the node has heard of tracks with ids below this one; a new center gives none of them again.
     """
 
     sensor: str
     incarnation: int
     next_ns: int
     digest: str
+    epoch: int = 0
+    next_id: int = 0
 
 
 class Start(NamedTuple):

@@ -71,7 +71,7 @@ class Center:
         epoch_ns: the instant of scenario time 0.
         speed: seconds of measurement time per second, 0: lockstep.
         wait_ns: how long to wait for the others, once a sensor has joined, before the clock starts.
-        first_epoch: later centers must use higher ones, so that nodes take over their tracks.
+        first_epoch: later centers should use higher ones; nodes tell a center of higher ones when they join.
         digest: of what node and center must have in common.
     """
 
@@ -182,7 +182,8 @@ class Center:
         member = state.members[number]
         epoch, lineage = member.epoch, member.lineage
         if not member.joined or join.incarnation != member.incarnation:
-            epoch, lineage = self._next_epoch(state), state.lineage
+            # Above what the node heard of from an earlier center, even if the clock was set back since.
+            epoch, lineage = max(self._next_epoch(state), join.epoch + 1), state.lineage
         member = Member(
             joined=True,
             alive=True,
@@ -191,7 +192,8 @@ class Center:
             next_ns=join.next_ns,
             lineage=lineage,
         )
-        state = state.with_member(number, member)
+        # Tracks of an earlier center keep their ids: those that begin from now on get others.
+        state = state.with_member(number, member)._replace(next_id=max(state.next_id, join.next_id))
         answer: list[Message] = [self._start(state, number, epoch)]
         if state.clock is not None:
             advice = self._advice(state) if state.history else []

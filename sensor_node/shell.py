@@ -15,7 +15,7 @@ from common.errors import ConfigError, DecodeError, TransportError, VersionError
 from common.health import Health, age_s
 from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
-from common.messages import NEVER, Advice, Begin, Clock, Join, Keys, Message, Rebase, Scan, Start, Stop
+from common.messages import NEVER, Advice, Begin, Clock, Keys, Message, Rebase, Scan, Start, Stop
 from common.transport import Bus, Publisher
 from sensor_node.tracker import LocalTracker
 
@@ -174,7 +174,7 @@ class NodeShell:
         # The first time counts: over a slow link a node asks again before it can have been answered.
         if self._clock is None and not self._joined_ns:
             self._joined_ns = time.time_ns()
-        self._publish(Join(self._name, self._incarnation, self._next_ns(), self._tracker.digest))
+        self._publish(self._tracker.join(self._state, self._incarnation, self._next_ns()))
 
     def _next_ns(self) -> int:
         return self._scans[self._position].time_ns if self._position < len(self._scans) else NEVER

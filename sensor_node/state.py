@@ -109,6 +109,7 @@ class State(NamedTuple):
         lineage: epoch of the newest rebase followed since the start message; 0: none.
         rebases: told, and not followed yet.
         next_id: tracks with lower ids, which the start message did not name, are no more.
+        known_id: tracks with lower ids have been heard of, from this or an earlier center.
         begun: tracks that began at a center whose start message has not come yet.
         maps: of each sensor's false plots; None for sensors that have none.
         ready: worked out ahead for the next scan, or None. It saves time and changes nothing.
@@ -122,6 +123,7 @@ class State(NamedTuple):
     lineage: int = 0
     rebases: tuple[Rebase, ...] = ()
     next_id: int = 0
+    known_id: int = 0
     begun: tuple[Begin, ...] = ()
     maps: tuple[ClutterMap | None, ...] = ()
     ready: Ready | None = None

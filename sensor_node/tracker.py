@@ -21,7 +21,7 @@ from common.estimation.pose import SensorPose
 from common.estimation.representation import globalise, shrink
 from common.estimation.selection import Selection, select
 from common.local_filter import SUREST, LocalFilter
-from common.messages import Advice, Begin, IntArray, Picked, Rebase, Report, Scan, Start, Stop
+from common.messages import NEVER, Advice, Begin, IntArray, Join, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
 from sensor_node.sight import Sight
 from sensor_node.state import Look, Ready, Schedule, State, Tracks, alike, left, put_tracks
@@ -186,6 +186,17 @@ class LocalTracker:
             heading=pose.heading,
         )
 
+    def join(self, state: State, incarnation: int, next_ns: int) -> Join:
+        """Ask a center for the tracks, and tell it up to where epochs and ids are taken.
+
+        Args:
+            state: of the node.
+            incarnation: random number of its process.
+            next_ns: time of its next scan.
+        """
+        epoch = max(state.epoch, state.lineage, *(rebase.epoch for rebase in state.rebases))
+        return Join(self.name, incarnation, next_ns, self.digest, epoch, state.known_id)
+
     def told(self, state: State, message: Start | Begin | Stop | Advice | Rebase) -> State:
         """Follow what the center says."""
         match message:
@@ -204,7 +215,8 @@ class LocalTracker:
         """Take over tracks, and catch up on the scans since their start; a higher epoch names all tracks there are."""
         if start.epoch > state.epoch:
             state = state._replace(epoch=start.epoch, tracks=self.initial().tracks, lineage=0, rebases=())
-        state = state._replace(next_id=start.next_id)
+        heard = _above(start.ids, start.next_id if start.next_id < NEVER else 0)
+        state = state._replace(next_id=start.next_id, known_id=max(state.known_id, heard))
         state = self._taken_over(state, take(self._fresh(start), ~np.isin(start.ids, state.tracks.ids)))
         begun, state = state.begun, state._replace(begun=())
         for begin in begun:
@@ -213,6 +225,7 @@ class LocalTracker:
 
     def begin(self, state: State, begin: Begin) -> State:
         """Keep tracks that begin, and catch up on the scans since; what the start message knew it has told."""
+        state = state._replace(known_id=_above(begin.ids, state.known_id))
         if state.epoch <= begin.epoch:
             return state._replace(begun=(*state.begun, begin))
         factor, zero = self.filter.share.start(Gaussian(begin.x, begin.P)), np.zeros(len(begin.ids))
@@ -402,6 +415,11 @@ class LocalTracker:
         # What has ended stays so.
         log_odds[tracks.log_odds == -np.inf] = -np.inf
         return log_odds
+
+
+def _above(ids: IntArray, least: int) -> int:
+    """The lowest id above all of ``ids``, and at least ``least``."""
+    return int(ids.max(initial=least - 1)) + 1
 
 
 def _interval(times_ns: IntArray, t_ns: int) -> Array:

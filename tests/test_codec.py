@@ -186,6 +186,8 @@ MESSAGES: dict[str, Message] = {
     "picked-moving": moving(with_unclaimed(picked(1, 3), 1)),
     "join": Join("radar-1", 2**63 - 1, EPOCH_NS, "0123456789abcdef"),
     "join-never": Join("radar-1", 0, NEVER, ""),
+    "join-again": Join("radar-1", 1, NEVER, "", 2**61, 2**31 - 1),
+    "join-of-an-epoch": Join("radar-1", 1, NEVER, "", 7, 0),
     **{f"start-{t}": start(t) for t in (0, 1, 100)},
     "start-3d": start(2, n=6),
     "start-last-of-all": start(1)._replace(next_id=NEVER),
@@ -377,6 +379,14 @@ GOLDEN = [
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840",  # x, P
     ),
     (
+        Join("a", 1, 10, "0f"),
+        "95 03 03 93 01 0a a2 3066 90 c400",  # version, kind, incarnation, next, digest
+    ),
+    (
+        Join("a", 1, 10, "0f", 7, 9),
+        "95 03 03 95 01 0a a2 3066 07 09 90 c400",  # epoch and next id of a node that has heard of any
+    ),
+    (
         Decision("merged", 7, 10, 0.5, 2.0, 12, into=4),
         "95 03 09 97 a66d6572676564 07 0a"  # version, kind, what, track, time
         "cb3fe0000000000000 cb4000000000000000 0c 04 90 c400",  # log_lr, log_lr_total, scans, into
@@ -440,7 +450,7 @@ def test_the_bytes_of_a_rounded_report_never_change(message: Message, golden: st
     assert same(decode(KEYS.of(message), payload), message)
 
 
-GOLDEN_NAMES = ["report", "unclaimed", "picked", "start", "begin", "advice", "rebase", "merged"]
+GOLDEN_NAMES = ["report", "unclaimed", "picked", "start", "begin", "advice", "rebase", "join", "join again", "merged"]
 
 
 @pytest.mark.parametrize(("message", "golden"), GOLDEN, ids=GOLDEN_NAMES)
@@ -606,6 +616,12 @@ def test_scalars_that_are_nan_are_refused(message: Message, name: str) -> None:
 def test_a_heading_that_is_nan_is_refused(message: Any) -> None:
     payload = encode(message._replace(heading=float("nan")))
     assert "heading is nan, expected a finite float" in refusal(payload, KEYS.of(message))
+
+
+@pytest.mark.parametrize("numbers", [(-1, 0), (0, -1), (2**62, 0), (0, 2**31), (2**63 - 1, 2**63 - 1)])
+def test_epochs_and_ids_that_a_center_could_not_count_on_from_are_refused(numbers: tuple[int, int]) -> None:
+    payload = altered(Join("radar-1", 1, 2, ""), scalars=[1, 2, "", *numbers])
+    assert "none that a center could count on from" in refusal(payload, KEYS.join("radar-1"))
 
 
 BLOCKS = msgpack.unpackb(encode(GOLDEN_REPORT))[4]

@@ -260,6 +260,41 @@ def test_a_node_that_is_restarted_is_told_of_the_tracks_that_began() -> None:
     assert len(network.confirmed) == 2
 
 
+@pytest.mark.parametrize("first_epoch", [10**9, 0], ids=["later", "clock set back"])
+@pytest.mark.parametrize("restarted", [(), ("a",)], ids=["all nodes live on", "one node restarted too"])
+def test_a_new_center_gives_no_id_of_the_old_one_again(first_epoch: int, restarted: tuple[str, ...]) -> None:
+    network = Network(two_boats())
+    half = len(network.scans) // 2
+    for scan in network.scans[:half]:
+        network.tell(network.scan(scan))
+    old = [track for begin in only(Begin, network.stage.said) for track in begin.ids.tolist()]
+    assert len(old) > 2
+    network.stage, last_ns = Stage(network.plot, speed=1.0, first_epoch=first_epoch), network.scans[half - 1].time_ns
+    for name in restarted:
+        network.nodes[name] = Node(network.plot, name)
+    # The clock begins with the last one that joins: here one that knows of the old center.
+    for name, node in network.nodes.items():
+        network.hear(network.stage.tell(node.tracker.join(node.state, 1, network.later(name, last_ns))))
+    for node in network.nodes.values():
+        assert len(node.state.tracks.ids) == 0
+    for scan in network.scans[half:]:
+        network.tell(network.scan(scan))
+    new = [track for begin in only(Begin, network.stage.said) for track in begin.ids.tolist()]
+    assert min(new) > max(old)
+    assert len(network.confirmed) == 2
+    assert network.stage.state.counts.refused == 0
+
+
+def test_who_asks_again_changes_no_ids_and_no_epoch() -> None:
+    network = Network(two_boats())
+    for scan in network.scans[:20]:
+        network.tell(network.scan(scan))
+    before, node = network.stage.state, network.nodes["a"]
+    network.hear(network.stage.tell(node.tracker.join(node.state, 1, before.members[0].next_ns)))
+    assert network.stage.state.next_id == before.next_id
+    assert network.stage.state.members[0] == before.members[0]
+
+
 def test_what_begins_before_a_node_has_its_start_message_waits_for_it() -> None:
     network = Network(two_boats())
     for scan in network.scans[:4]:

@@ -59,13 +59,15 @@ def run(
     """
     from rich.console import Console
 
+    from launch.checks import warn
     from launch.run import Order, execute
-    from sensor_node.sources import all_scans, seed_of
+    from sensor_node.sources import all_scans, recording_of, seed_of
 
     path = find(scenario)
     loaded = load_scenario(path)
     plots = plots.resolve() if plots else None
     scans = all_scans(loaded, plots=plots, seed=seed)
+    warn(loaded, scans, recording_of(loaded, plots))
     stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")
     order = Order(
         scenario=loaded,
@@ -97,7 +99,8 @@ def replay(
         lag: with --json, say in each line also where the track was so many seconds ago, with everything known now.
         centralised: let one tracker have all plots, instead of a network: the yardstick for what a network finds.
     """
-    from sensor_node.sources import all_scans
+    from launch.checks import warn
+    from sensor_node.sources import all_scans, recording_of
     from studies.centralised import Centralised
     from studies.lines import TrackLines
     from studies.replay import Replay
@@ -108,6 +111,7 @@ def replay(
     lines = TrackLines(loaded, lag)
     final: dict[int, str] = {}
     scans = all_scans(loaded, plots=plots)
+    warn(loaded, scans, recording_of(loaded, plots))
     for message in Centralised.of(loaded).run(scans) if centralised else Replay(loaded, scans).run():
         if isinstance(message, Tracks) and as_json:
             sys.stdout.writelines(line + "\n" for line in lines.of(message))
@@ -149,13 +153,20 @@ def simulate(scenario: str, *, seed: Seed | None = None, out: Path | None = None
 
 
 @app.command
-def check(scenario: str, plots: Path | None = None) -> None:
-    """Validate a scenario file, and its recorded plots and trajectories if it has any.
+def check(
+    scenario: str,
+    plots: Path | None = None,
+    *,
+    strict: Annotated[bool, Parameter(negative=())] = False,
+) -> None:
+    """Validate a scenario file, and its recorded plots and trajectories if it has any, and warn of what does not fit.
 
     Args:
         scenario: scenario file, or name of one that comes along.
         plots: recorded plots to validate too, instead of the scenario's.
+        strict: end with exit code 1 if there is a warning (notes are none).
     """
+    from launch.checks import findings, recording_table, warnings
     from scenarios.plots import read_plots
     from scenarios.trajectories import read_trajectories
 
@@ -166,11 +177,16 @@ def check(scenario: str, plots: Path | None = None) -> None:
         f"simulated targets; {fusion.mode}, association {fusion.association}, feedback {fusion.feedback}"
     )
     recording = plots or (loaded.recording.plots if loaded.recording else None)
-    if recording is not None:
-        scans = read_plots(recording, loaded)
+    scans = read_plots(recording, loaded) if recording is not None else []
+    if scans:
         print(f"{recording}: {len(scans)} scans, {sum(len(scan.z) for scan in scans)} plots")
+        print("\n".join(recording_table(loaded, scans)))
     if trajectories := read_trajectories(loaded):
         print(f"recorded targets: {len(trajectories)}")
+    found = findings(loaded, scans)
+    print("\n".join(warnings(found)), end="\n" if found else "")
+    if strict and any(finding.spoils for finding in found):
+        sys.exit(1)
 
 
 @app.command

@@ -1,0 +1,580 @@
+"""Whether recorded scans are what a scenario expects: times, intervals, units, axes, empty and repeated scans.
+
+All functions are pure: scans and scenario in, summaries and findings out. A finding is a sentence about a class of
+mistakes; what a correct recording can contain by chance gives none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from common.config import Scenario, SensorConfig
+from common.estimation.association import innovations
+from common.estimation.gaussian import Array, BoolArray, Gaussian, log_pdf, times_transposed
+from common.estimation.initiation import from_plots
+from common.estimation.sector import Sector
+from common.estimation.sensing import Sensor
+from common.messages import Scan
+from scenarios.scenario_check import Finding, hypotheses_at
+
+_YEAR_S = 365.25 * 86_400.0
+#: A plot whose place lies inside with less than this probability, its noise considered, is outside.
+_OUTSIDE = 1e-3
+#: So many plots are looked at, spread over the recording.
+_SAMPLE = 5000
+#: So many scans after the start of a hypothesis are compared with it.
+_FIRST_SCANS = 10
+#: So many other sensors are compared with each.
+_OTHERS = 5
+#: With fewer scans than this nothing is said of intervals and counts.
+_FEW = 5
+
+
+class SensorSummary(NamedTuple):
+    """A sensor's part of a recording.
+
+    Attributes:
+        name: of the sensor.
+        scans: their number; without any, all that follows is NaN.
+        plots: their number.
+        first_s: time of the first scan, since the epoch.
+        last_s: time of the last scan.
+        interval_s: median time between scans.
+        plots_per_scan: mean.
+        empty: share of scans without plots.
+        outside: share of plots outside the field of view.
+        repeated: share of scans, of those with plots, that repeat the plots of the scan before.
+    """
+
+    name: str
+    scans: int
+    plots: int
+    first_s: float
+    last_s: float
+    interval_s: float
+    plots_per_scan: float
+    empty: float
+    outside: float
+    repeated: float
+
+
+class _Recorded(NamedTuple):
+    """The scans of one sensor, by time, and what is expected of them."""
+
+    config: SensorConfig
+    sensor: Sensor
+    dimensions: int
+    n: int
+    times_s: Array
+    scans: tuple[Scan, ...]
+
+    @property
+    def where(self) -> str:
+        return f"sensor {self.config.name}"
+
+    @property
+    def intervals_s(self) -> Array:
+        return np.diff(self.times_s)
+
+    @property
+    def tells_place(self) -> bool:
+        return self.config.kind != "bearing"
+
+    @property
+    def extent(self) -> float:
+        """Side of a square or cube as large as the field of view [m]."""
+        return float(self.sensor.field_of_view.volume ** (1.0 / self.dimensions))
+
+
+class _Reading(NamedTuple):
+    """Another way to read plots, which would explain what does not fit."""
+
+    meaning: str
+    read: Callable[[Array, Array], Array]
+
+
+def summarise(scenario: Scenario, scans: Sequence[Scan]) -> list[SensorSummary]:
+    """What a recording has of each sensor of a scenario, in the order of the scenario.
+
+    Args:
+        scenario: names the sensors and their fields of view.
+        scans: by time.
+    """
+    return [_summary(one) for one in _by_sensor(scenario, scans)]
+
+
+def recording_findings(scenario: Scenario, scans: Sequence[Scan]) -> list[Finding]:
+    """What does not fit between a recording and its scenario, what spoils results first.
+
+    Args:
+        scenario: the scenario.
+        scans: those that are used, by time: without those that ``spacing`` passes over.
+    """
+    every = _by_sensor(scenario, scans)
+    recorded = [one for one in every if one.scans]
+    findings = [
+        Finding(
+            one.where, "has no scan in the recording: it is as if it were switched off. Check its name in the file."
+        )
+        for one in every
+        if not one.scans
+    ]
+    findings += [*_epoch(scenario, recorded), *_apart_in_time(recorded), *_starts(scenario, recorded)]
+    for one in recorded:
+        # Repeated scans have intervals and gaps of their own.
+        findings += list(_repeats(one)) or list(_intervals(scenario, one))
+        findings += [*_counts(scenario, one), *_places(one)]
+    findings += [*_copies(recorded), *_against_hypotheses(scenario, recorded), *_between_sensors(scenario, recorded)]
+    return sorted(findings, key=lambda finding: not finding.spoils)
+
+
+def _by_sensor(scenario: Scenario, scans: Sequence[Scan]) -> list[_Recorded]:
+    motion = scenario.motion.build()
+    own: dict[str, list[Scan]] = {name: [] for name in scenario.sensor_names}
+    for scan in scans:
+        own[scan.sensor].append(scan)
+    return [
+        _Recorded(
+            config,
+            config.build(motion),
+            motion.dimensions,
+            motion.n,
+            np.array([scenario.to_seconds(scan.time_ns) for scan in own[config.name]]),
+            tuple(own[config.name]),
+        )
+        for config in scenario.sensors
+    ]
+
+
+def _summary(one: _Recorded) -> SensorSummary:
+    counts, nan = np.array([len(scan.z) for scan in one.scans]), float("nan")
+    if not one.scans:
+        return SensorSummary(one.config.name, 0, 0, *[nan] * 7)
+    outside, repeats, full = _outside(one), _repeated(one), int((counts > 0).sum())
+    return SensorSummary(
+        name=one.config.name,
+        scans=len(one.scans),
+        plots=int(counts.sum()),
+        first_s=float(one.times_s[0]),
+        last_s=float(one.times_s[-1]),
+        interval_s=float(np.median(one.intervals_s)) if len(counts) > 1 else nan,
+        plots_per_scan=float(counts.mean()),
+        empty=float((counts == 0).mean()),
+        outside=float(outside.mean()) if len(outside) else nan,
+        repeated=len(repeats) / full if full else nan,
+    )
+
+
+# Times ----------------------------------------------------------------------------------------------------------------
+
+
+def _epoch(scenario: Scenario, recorded: Sequence[_Recorded]) -> Iterator[Finding]:
+    far = [one for one in recorded if abs(one.times_s[0]) > _YEAR_S]
+    if far:
+        years = abs(far[0].times_s[0]) / _YEAR_S
+        yield Finding(
+            f"time of {', '.join(one.config.name for one in far)}",
+            f"the first scan is at {far[0].times_s[0]:.10g} s, {years:.3g} years from the scenario's epoch "
+            f"({scenario.epoch.isoformat()}). Times are seconds since the epoch. If these are Unix times, write "
+            "epoch = 1970-01-01T00:00:00Z and let the hypotheses start at Unix times too, or subtract the epoch.",
+        )
+
+
+def _apart_in_time(recorded: Sequence[_Recorded]) -> Iterator[Finding]:
+    """Sensors whose scans are all before, or all after, those of every other."""
+    for one in recorded:
+        others = [other for other in recorded if other is not one]
+        slack = 10.0 * float(np.median(one.intervals_s)) if len(one.scans) > 1 else 0.0
+        first, last = one.times_s[0] - slack, one.times_s[-1] + slack
+        if others and all(other.times_s[-1] < first or other.times_s[0] > last for other in others):
+            yield Finding(
+                one.where,
+                f"its scans, {one.times_s[0]:.10g} s to {one.times_s[-1]:.10g} s, have no time in common with those of "
+                f"any other sensor ({others[0].config.name}: {others[0].times_s[0]:.10g} s to "
+                f"{others[0].times_s[-1]:.10g} s). Expected is one clock, in seconds, for all sensors.",
+            )
+
+
+def _starts(scenario: Scenario, recorded: Sequence[_Recorded]) -> Iterator[Finding]:
+    """Hypotheses that start after the last scan, or so long before the first that nothing is known of them by then."""
+    if not (scenario.hypotheses and recorded):
+        return
+    first, last = min(one.times_s[0] for one in recorded), max(one.times_s[-1] for one in recorded)
+    starts = np.array([hypothesis.start for hypothesis in scenario.hypotheses])
+    if late := np.flatnonzero(starts > last).tolist():
+        yield Finding(
+            _numbered(late),
+            f"starts at {starts[late[0]]:.10g} s, after the last scan at {last:.10g} s, and is never tested. Times are "
+            "seconds since the scenario's epoch.",
+        )
+    d = scenario.motion.dimensions
+    then = hypotheses_at(scenario, np.full(len(starts), first)).P.diagonal(axis1=-2, axis2=-1)[:, :d].max(axis=-1)
+    sigmas = np.array([max(hypothesis.sigma[:d]) for hypothesis in scenario.hypotheses])
+    scan_s = max([float(np.median(one.intervals_s)) for one in recorded if len(one.scans) > 1], default=0.0)
+    vague = (np.sqrt(then) > 10.0 * sigmas) & (first - starts > 5.0 * scan_s)
+    if early := np.flatnonzero(vague).tolist():
+        yield Finding(
+            _numbered(early),
+            f"starts {first - starts[early[0]]:.10g} s before the first scan, by when its position is known to "
+            f"{np.sqrt(then[early[0]]):.3g} m only (at its start: {sigmas[early[0]]:g} m). Let it start with the "
+            "recording; times are seconds since the scenario's epoch.",
+        )
+
+
+def _numbered(rows: Sequence[int]) -> str:
+    more = f" and {len(rows) - 5} more" if len(rows) > 5 else ""
+    return ", ".join(f"hypothesis.{row}" for row in rows[:5]) + more
+
+
+def _intervals(scenario: Scenario, one: _Recorded) -> Iterator[Finding]:
+    if len(one.scans) < _FEW:
+        return
+    median, claimed = float(np.median(one.intervals_s)), one.config.scan_interval
+    speed, set_by_user = _speed(scenario), "scan_interval" in one.config.model_fields_set
+    if (missing := _left_out(one)) is not None:
+        yield missing
+    elif set_by_user and one.config.spacing <= claimed and not 1 / 1.5 < median / claimed < 1.5:
+        milli = 300.0 < median / claimed < 3000.0
+        unit = "Are these milliseconds? Times are in seconds." if milli else ""
+        yield Finding(
+            one.where,
+            f"the median time between scans is {median:.4g} s, but scan_interval = {claimed:g}. "
+            + (unit or f"If the recording is right, write scan_interval = {median:.3g}."),
+            spoils=milli,
+        )
+    if speed is not None and np.isfinite(one.extent) and speed * median > one.extent:
+        yield Finding(
+            one.where,
+            f"between two scans ({median:.4g} s) a target of {speed:.3g} m/s goes {speed * median:.3g} m, farther than "
+            f"the field of view is wide ({one.extent:.3g} m): no track can be held. Are times in milliseconds, or "
+            "lengths in kilometres? Expected are seconds and metres.",
+        )
+
+
+def _speed(scenario: Scenario) -> float | None:
+    """How fast targets are expected to be [m/s], if the scenario says so."""
+    if scenario.initiation is not None:
+        return scenario.initiation.speed
+    d = scenario.motion.dimensions
+    moving = [np.square([*h.state[d : 2 * d], *h.sigma[d : 2 * d]]).sum() for h in scenario.hypotheses]
+    return float(np.sqrt(np.median(moving))) if moving else None
+
+
+def _left_out(one: _Recorded) -> Finding | None:
+    """Scans that are missing where empty ones should be: no scan is empty, and between them are gaps of whole scans."""
+    counts, intervals = np.array([len(scan.z) for scan in one.scans]), one.intervals_s
+    if counts.min() != 1 or one.config.spacing > 0.0:
+        return None
+    base = float(np.quantile(intervals, 0.05))
+    if np.std(intervals) > 0.3 * np.mean(intervals):
+        base = min(base, one.config.scan_interval)
+    missing = int(np.maximum(np.round(intervals / base) - 1.0, 0.0).sum())
+    share = missing / (missing + len(counts))
+    if missing < 3 or share < 0.05:
+        return None
+    return Finding(
+        one.where,
+        f"no scan is empty, the smallest have one plot, and between them about {missing} scans of {base:.3g} s are "
+        f'missing ({share:.0%}). If the sensor scanned then and found nothing, write these scans with "plots": []: '
+        "without them every miss is lost, and the evidence for each track is too large.",
+    )
+
+
+# Counts ---------------------------------------------------------------------------------------------------------------
+
+
+def _counts(scenario: Scenario, one: _Recorded) -> Iterator[Finding]:
+    counts, false = np.array([len(scan.z) for scan in one.scans]), one.config.false_plots
+    if len(counts) < _FEW:
+        return
+    mean, p_d, targets = float(counts.mean()), one.config.p_d or 1.0, len(scenario.hypotheses)
+    if mean < 0.5 * false and false * len(counts) > 20.0:
+        yield Finding(
+            one.where,
+            f"{mean:.3g} plots per scan, those of targets included, but false_plots = {false:g} alone: evidence is "
+            "weaker than it could be. waldnet measure tells both apart.",
+            spoils=False,
+        )
+    most = 3.0 * (false + p_d * targets) + 1.0
+    if scenario.initiation is None and mean > most and len(counts) >= 10:
+        yield Finding(
+            one.where,
+            f"{mean:.3g} plots per scan, but expected are {false:g} false ones and at most {p_d:g} of each of "
+            f"{targets} hypotheses. With false_plots too small, false plots pass for targets: "
+            "measure it with waldnet measure.",
+        )
+
+
+def _repeated(one: _Recorded) -> list[int]:
+    """Rows of the scans that have the plots of the scan before, to the last digit."""
+    return [
+        k
+        for k in range(1, len(one.scans))
+        if len(one.scans[k].z) and np.array_equal(one.scans[k].z, one.scans[k - 1].z)
+    ]
+
+
+def _repeats(one: _Recorded) -> Iterator[Finding]:
+    rows, full = _repeated(one), sum(len(scan.z) > 0 for scan in one.scans)
+    if len(rows) < 3 or len(rows) < 0.05 * full:
+        return
+    every = _between_payloads(one, rows)
+    advice = f"set spacing = {every:.3g}" if every > 0.0 else "read the sensor less often"
+    yield Finding(
+        one.where,
+        f"{len(rows)} of {full} scans with plots repeat the plots of the scan before to the last digit, under a new "
+        "time. One look counts as evidence several times, and false plots are confirmed as targets. Leave repeated "
+        f"scans out of the recording, or {advice}.",
+    )
+
+
+def _between_payloads(one: _Recorded, repeated: Sequence[int]) -> float:
+    """How long the sensor takes for new plots, rounded down to three digits [s]; NaN if that cannot be told."""
+    again = set(repeated)
+    firsts = [k - 1 for k in repeated if k - 1 not in again]
+    nexts = [next((j for j in range(k + 2, len(one.scans)) if j not in again), None) for k in firsts]
+    spans = [float(one.times_s[j] - one.times_s[k]) for k, j in zip(firsts, nexts, strict=True) if j is not None]
+    if not spans:
+        return float("nan")
+    every = float(np.median(spans))
+    digit = 10.0 ** (np.floor(np.log10(every)) - 2.0)
+    return float(np.floor(every / digit) * digit)
+
+
+def _copies(recorded: Sequence[_Recorded]) -> Iterator[Finding]:
+    """Sensors that have the plots of another one."""
+    seen = [{scan.z.tobytes() for scan in one.scans if scan.z.size} for one in recorded]
+    for i, one in enumerate(recorded):
+        for j, other in enumerate(recorded[:i]):
+            full = sum(scan.z.size > 0 for scan in one.scans)
+            same = sum(scan.z.tobytes() in seen[j] for scan in one.scans if scan.z.size)
+            if one.config.kind == other.config.kind and same >= 3 and same >= 0.05 * full:
+                yield Finding(
+                    one.where,
+                    f"{same} of {full} scans with plots are those of {other.config.name} to the last digit: one look "
+                    "counts as evidence of two sensors. Each scan belongs to one sensor.",
+                )
+
+
+# Places ---------------------------------------------------------------------------------------------------------------
+
+
+def _sampled(one: _Recorded) -> tuple[Array, Array]:
+    """Some plots, spread over the recording, and where the sensor stood, shapes (M, m), (M, d)."""
+    counts = np.array([len(scan.z) for scan in one.scans])
+    z = np.concatenate([scan.z for scan in one.scans])
+    stands = np.repeat(np.array([scan.position for scan in one.scans]), counts, axis=0)
+    chosen = np.unique(np.linspace(0, len(z) - 1, min(_SAMPLE, len(z))).astype(int))
+    return z[chosen], stands[chosen]
+
+
+def _outside(one: _Recorded) -> BoolArray:
+    """Which of some plots lie outside the field of view, their noise considered, shape (M,)."""
+    return _outside_view(one, *_sampled(one))
+
+
+def _outside_view(one: _Recorded, z: Array, stands: Array) -> BoolArray:
+    centers = _centers(one, stands)
+    if not len(z):
+        return np.zeros(0, np.bool_)
+    if not one.tells_place:
+        return _outside_directions(one, z)
+    view, places = one.sensor.field_of_view, _located(one, z, stands)
+    outside = np.array(~view.contains(places, centers))
+    for k in np.flatnonzero(outside).tolist():
+        density = _density(one, z[k : k + 1], stands[k])
+        outside[k] = view.probability_inside(density, centers[k])[0] < _OUTSIDE
+    return outside
+
+
+def _outside_directions(one: _Recorded, z: Array) -> BoolArray:
+    view = one.sensor.field_of_view
+    if not isinstance(view, Sector):
+        return np.zeros(len(z), np.bool_)
+    near, origin = view._replace(radius=2.0, inner=0.0), np.zeros(one.dimensions)
+    margins = 3.0 * np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1)])[:, : z.shape[1]] * one.config.sigma
+    around = one.sensor.measurement.locate(z[:, None] + margins, origin)
+    return np.array(~near.contains(around, origin).any(axis=1))
+
+
+def _centers(one: _Recorded, stands: Array) -> Array:
+    """Centers of the field of view, shape (M, d)."""
+    return np.array([one.config.view_center(stand) for stand in stands]).reshape(-1, one.dimensions)
+
+
+def _located(one: _Recorded, z: Array, stands: Array) -> Array:
+    """The places of plots, shape (M, d)."""
+    origin = np.zeros(one.dimensions)
+    return z if one.config.kind == "position" else stands + one.sensor.measurement.locate(z, origin)
+
+
+def _density(one: _Recorded, z: Array, stand: Array) -> Gaussian:
+    """Positions that plots tell of, shapes (M, d), (M, d, d)."""
+    d = one.dimensions
+    density = from_plots(z, one.sensor.measurement, stand, np.ones(one.n - d))
+    return Gaussian(density.x[:, :d], density.P[:, :d, :d])
+
+
+def _readings(one: _Recorded) -> list[_Reading]:
+    """Other ways to read a sensor's plots."""
+    kind = one.config.kind
+
+    def with_first(first: Callable[[Array], Array], column: int) -> Callable[[Array, Array], Array]:
+        def read(z: Array, stands: Array) -> Array:  # noqa: ARG001 (readings that need the stand have it)
+            z = z.copy()
+            z[:, column] = first(z[:, column])
+            return z
+
+        return read
+
+    if kind == "position":
+        order = [1, 0, 2][: one.dimensions]
+        return [
+            _Reading("north before east", lambda z, _: z[:, order]),
+            _Reading("kilometres", lambda z, _: 1000.0 * z),
+            _Reading("metres from the sensor instead of the origin", lambda z, stands: z + stands),
+        ]
+    azimuth = 0 if kind == "bearing" else 1
+    turned = [
+        _Reading("azimuths counted counterclockwise from east", with_first(lambda a: 0.5 * np.pi - a, azimuth)),
+        _Reading("azimuths counted counterclockwise from north", with_first(np.negative, azimuth)),
+    ]
+    return turned if kind == "bearing" else [*turned, _Reading("kilometres", with_first(lambda r: 1000.0 * r, 0))]
+
+
+def _places(one: _Recorded) -> Iterator[Finding]:
+    z, stands = _sampled(one)
+    outside = _outside_view(one, z, stands)
+    if outside.sum() >= 5 and outside.mean() > 0.02:
+        better = [
+            reading.meaning
+            for reading in _readings(one)
+            if _outside_view(one, reading.read(z, stands), stands).mean() < 0.1 * outside.mean()
+        ]
+        what = f"Read as {' or '.join(better)} they would lie inside." if better else "Check its size and position."
+        yield Finding(
+            one.where,
+            f"{outside.mean():.1%} of the plots lie outside the field of view, their noise considered; expected are "
+            f"none. They are no evidence for tracks there, and pass for false plots. {what}",
+            spoils=bool(outside.mean() > 0.2),
+        )
+    if one.tells_place and len(z) >= 20 and np.isfinite(one.extent):
+        away = np.linalg.vector_norm(_located(one, z, stands) - _centers(one, stands), axis=-1)
+        if np.quantile(away, 0.9) < 0.01 * one.extent:
+            other = "" if one.config.kind == "position" else ", or does the azimuth come before the range"
+            yield Finding(
+                one.where,
+                f"9 of 10 plots lie within {np.quantile(away, 0.9):.3g} m of the center of a field of view that is "
+                f"{one.extent:.3g} m wide. Are these kilometres{other}? Lengths are in metres.",
+            )
+
+
+def _against_hypotheses(scenario: Scenario, recorded: Sequence[_Recorded]) -> Iterator[Finding]:
+    """Plots that support the hypotheses only if they are read in another way."""
+    if not scenario.hypotheses:
+        return
+    for one in recorded:
+        evidence = _evidence(scenario, one, lambda z, _: z)
+        for reading in _readings(one):
+            other = _evidence(scenario, one, reading.read)
+            if other > 3.0 * evidence + 20.0:
+                yield Finding(
+                    one.where,
+                    f"its first scans support the hypotheses with log LR {evidence:+.0f}, but with {other:+.0f} if its "
+                    f"plots are read as {reading.meaning}. Expected is what docs/how-to/sensors.md says: metres, "
+                    "radians, east before north, azimuth clockwise from north.",
+                )
+
+
+def _evidence(scenario: Scenario, one: _Recorded, read: Callable[[Array, Array], Array]) -> float:
+    """Sum over hypotheses of the log LR of the first scans after their start, where it is positive."""
+    total, sensor = np.zeros(len(scenario.hypotheses)), one.sensor
+    starts = np.array([hypothesis.start for hypothesis in scenario.hypotheses])
+    ranks = np.zeros(len(starts), np.int64)
+    for time_s, scan in zip(one.times_s, one.scans, strict=True):
+        rows = np.flatnonzero((starts <= time_s) & (ranks < _FIRST_SCANS))
+        if not len(rows):
+            if (ranks >= _FIRST_SCANS).all():
+                break
+            continue
+        ranks[rows] += 1
+        at = hypotheses_at(scenario, np.full(len(starts), time_s))
+        density = Gaussian(at.x[rows], at.P[rows])
+        p_d = sensor.detection_probability(density, scan.position, one.config.view_center(scan.position))
+        z = read(scan.z, np.broadcast_to(scan.position, (len(scan.z), one.dimensions)))
+        total[rows] += np.log(np.maximum(1.0 - p_d + p_d * _ratio(sensor, density, z, scan.position), 1e-9))
+    return float(np.maximum(total, 0.0).sum())
+
+
+def _ratio(sensor: Sensor, density: Gaussian, z: Array, stand: Array) -> Array:
+    """Sum over plots of their densities as a target's and as false ones, shape (K,)."""
+    if not len(z):
+        return np.zeros(len(density.x))
+    seen = sensor.measurement.linearise(density, stand)
+    S = seen.H @ times_transposed(density.P, seen.H) + seen.R
+    nu = innovations(z[None], seen.z[:, None], seen.angular)
+    relative = sensor.log_relative(z, stand)
+    log_f = sensor.log_rho_f + (0.0 if relative is None else relative)
+    log_ratio = log_pdf(nu, Gaussian(np.zeros_like(nu), S[:, None])) - log_f
+    ratio: Array = np.exp(np.minimum(log_ratio, 50.0)).sum(axis=-1)
+    return ratio
+
+
+def _between_sensors(scenario: Scenario, recorded: Sequence[_Recorded]) -> Iterator[Finding]:
+    """Sensors whose plots meet those of the others only if they are read in another way."""
+    placed = [one for one in recorded if one.tells_place and sum(len(scan.z) for scan in one.scans) >= 20]
+    speed = _speed(scenario)
+    if len(placed) < 2 or speed is None:
+        return
+    for one in placed:
+        others = [other for other in placed if other is not one][:_OTHERS]
+        meets = _meetings(one, others, lambda z, _: z, speed)
+        for reading in _readings(one):
+            better = _meetings(one, others, reading.read, speed)
+            if better >= 20 and better > 3.0 * meets and _stays_inside(one, reading):
+                yield Finding(
+                    one.where,
+                    f"{meets} of its plots lie near plots of other sensors, but {better} if they are read as "
+                    f"{reading.meaning}. Expected of all sensors are metres, radians, east before north, azimuth "
+                    "clockwise from north.",
+                )
+
+
+def _stays_inside(one: _Recorded, reading: _Reading) -> bool:
+    """Whether plots read in another way lie in the field of view no less than as they are."""
+    z, stands = _sampled(one)
+    as_read = _outside_view(one, reading.read(z, stands), stands)
+    return bool(as_read.mean() <= _outside_view(one, z, stands).mean() + 0.02)
+
+
+def _meetings(one: _Recorded, others: Sequence[_Recorded], read: Callable[[Array, Array], Array], speed: float) -> int:
+    """How many of a sensor's plots have one of another sensor near them, in place and time."""
+    z, stands, times_s = _all(one)
+    places, near = _located(one, read(z, stands), stands), np.zeros(len(z), np.bool_)
+    for other in others:
+        span = max(float(np.median(each.intervals_s)) for each in (one, other) if len(each.scans) > 1)
+        z_other, stands_other, times_other = _all(other)
+        reach = 3.0 * (_noise(one, z, stands) + _noise(other, z_other, stands_other)) + speed * span
+        tree = cKDTree(np.column_stack([_located(other, z_other, stands_other) / reach, times_other / span]))
+        distance, _ = tree.query(np.column_stack([places / reach, times_s / span]), p=np.inf, distance_upper_bound=1.0)
+        near |= np.isfinite(distance)
+    return int(near.sum())
+
+
+def _all(one: _Recorded) -> tuple[Array, Array, Array]:
+    """Plots of the first scans, where the sensor stood, and when."""
+    counts = np.array([len(scan.z) for scan in one.scans])
+    last = int(np.searchsorted(np.cumsum(counts), _SAMPLE)) + 1
+    z = np.concatenate([scan.z for scan in one.scans[:last]])
+    stands = np.repeat(np.array([scan.position for scan in one.scans[:last]]), counts[:last], axis=0)
+    return z, stands, np.repeat(one.times_s[:last], counts[:last])
+
+
+def _noise(one: _Recorded, z: Array, stands: Array) -> float:
+    """A standard deviation of the places of plots [m]."""
+    middle = len(z) // 2
+    return float(np.sqrt(np.linalg.eigvalsh(_density(one, z[middle : middle + 1], stands[middle]).P).max()))

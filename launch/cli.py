@@ -184,7 +184,8 @@ def check(
     if trajectories := read_trajectories(loaded):
         print(f"recorded targets: {len(trajectories)}")
     found = findings(loaded, scans)
-    print("\n".join(warnings(found)), end="\n" if found else "")
+    for line in warnings(found):
+        print(line)
     if strict and any(finding.spoils for finding in found):
         sys.exit(1)
 

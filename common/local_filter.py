@@ -147,13 +147,13 @@ class LocalFilter:
             center: of its field of view [m], shape (d,).
             visible: probability of each track to be visible to it, shape (T,); None: all are.
         """
-        p_d = sensor.without_notch.detection_probability(Gaussian(density.x[-1], density.P[-1]), stand, center)
+        p_d = sensor.without_notch.detection_probability(Gaussian(density.x[-1], density.P[-1]), stand)
         p_d = p_d if visible is None else p_d * visible[:, None]
-        clutter = Clutter(p_d, np.array(sensor.log_rho_f), self.gate_probability)
+        clutter = Clutter(p_d, np.array(sensor.log_rho_f), self.gate_probability, sensor.view(center))
         return expect(density, sensor.measurement.linearise(density, stand), clutter)
 
     def near(self, expected: Expected, plots: Plots, sensor: Sensor, stand: Array) -> Plots:
-        """The plots near the tracks, and how dense false ones are there.
+        """The plots near the tracks, how dense false ones are there, and whether tracks that have them are in view.
 
         Args:
             expected: the tracks as the sensor will see them.

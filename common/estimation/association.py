@@ -17,6 +17,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.special import gammaincinv
 
+from common.estimation.field_of_view import View
 from common.estimation.gating import IntArray, Near, inside_boxes
 from common.estimation.gaussian import (
     LOG_2PI,
@@ -47,26 +48,31 @@ class Plots(NamedTuple):
         log_relative: log of the density of false plots where a plot lies, relative to ``Clutter.log_rho_f``, shape
             (..., M). None: it is the same everywhere.
         number: which plot of its scan each is, where each track has those near it, shape (..., M). None: in order, all.
+        log_in_view: log of the probability that a track is in the field of view if a plot is its own (Eq. 6a), shape
+            (..., M). None: it surely is, or ``in_view`` has not worked it out yet.
     """
 
     z: Array
     valid: BoolArray | None = None
     log_relative: Array | None = None
     number: IntArray | None = None
+    log_in_view: Array | None = None
 
 
 class Clutter(NamedTuple):
-    """What is not the target.
+    """How a sensor detects, and what it takes for a target.
 
     Attributes:
-        p_d: detection probability, shape (...).
+        p_d: detection probability in the field of view, shape (...).
         log_rho_f: logarithm of the density of false plots [1/volume of z], shape (...).
         p_g: probability that the target's plot is inside the gate; 1 is no gate.
+        view: where a target can be detected; None: everywhere.
     """
 
     p_d: Array
     log_rho_f: Array
     p_g: float
+    view: View | None = None
 
 
 class Expected(NamedTuple):
@@ -83,10 +89,12 @@ class Expected(NamedTuple):
         W: whitened gains, shape (F, ..., n, m).
         P_hit: covariances after a plot that is surely the target's, shape (F, ..., n, n).
         log_peak: log N(z; z, S_k), shape (F, ...).
-        log_miss: log p*_0 (Eq. 6), shape (...).
-        log_hit: log (p_d / rho_f), shape (...).
+        log_miss: log p*_0 (Eq. 6, 6a), shape (...).
+        log_hit: log (p_d / rho_f), shape (...); -inf for tracks that are surely out of view.
         gate: squared Mahalanobis distance up to which a plot counts.
         angular: which numbers of a plot are angles.
+        view: where a target can be detected; None: everywhere.
+        edge: tracks that may be in view or not, so that each plot must tell, shape (...); None: there is none.
     """
 
     density: Gaussian
@@ -100,6 +108,8 @@ class Expected(NamedTuple):
     log_hit: Array
     gate: float
     angular: tuple[int, ...]
+    view: View | None = None
+    edge: BoolArray | None = None
 
 
 #: Weights p_j, shape (..., 1 + M), and log p_bar, shape (...), from log p*_j, shape (..., 1 + M).
@@ -124,8 +134,9 @@ def expect(predicted: Gaussian, sensor: Linearised, clutter: Clutter) -> Expecte
     Args:
         predicted: one or two filters of every track, shapes (F, ..., n), (F, ..., n, n).
         sensor: the measurement function linearised at ``predicted.x``.
-        clutter: detection probability, false plots, gate: one for all filters of a track, because whether the sensor
-            sees the target is for the honest density to say, not for a factor that is n_sensors times too wide.
+        clutter: detection probability, false plots, gate, field of view: one for all filters of a track, because
+            whether the sensor sees the target is for the honest density to say, not for a factor that is n_sensors
+            times too wide.
 
     Returns:
         what ``update`` needs.
@@ -135,6 +146,7 @@ def expect(predicted: Gaussian, sensor: Linearised, clutter: Clutter) -> Expecte
     white, half_log_det = whitener(S)
     m = white.shape[-1]
     W = times_transposed(PH, white)
+    p_miss, p_hit, edge = _in_view(Gaussian(predicted.x[-1], predicted.P[-1]), clutter)
     return Expected(
         density=predicted,
         z=sensor.z,
@@ -143,11 +155,33 @@ def expect(predicted: Gaussian, sensor: Linearised, clutter: Clutter) -> Expecte
         W=W,
         P_hit=joseph(predicted.P, W @ white, sensor.H, sensor.R),
         log_peak=-half_log_det - 0.5 * LOG_2PI * m,
-        log_miss=_log(1.0 - clutter.p_d * clutter.p_g),
-        log_hit=_log(clutter.p_d) - clutter.log_rho_f,
+        log_miss=_log(1.0 - p_miss * clutter.p_g),
+        log_hit=_log(p_hit) - clutter.log_rho_f,
         gate=gate_threshold(clutter.p_g, m),
         angular=sensor.angular,
+        view=clutter.view,
+        edge=edge,
     )
+
+
+def _in_view(honest: Gaussian, clutter: Clutter) -> tuple[Array, Array, BoolArray | None]:
+    """Detection probabilities of tracks that may be out of view.
+
+    Args:
+        honest: predicted, shapes (..., n), (..., n, n).
+        clutter: detection probability and field of view.
+
+    Returns:
+        the mean detection probability, which a miss tells of, and the one in the field of view, which a plot tells of
+        (0 where no plot can be the target's), shapes (...); which tracks may be in view or not, shape (...), None:
+        none.
+    """
+    if clutter.view is None:
+        return clutter.p_d, clutter.p_d, None
+    inside = clutter.view.probability_inside(honest)
+    edge = (inside > 0.0) & (inside < 1.0)
+    mean = clutter.p_d * inside
+    return mean, np.where(edge, clutter.p_d, mean), edge if edge.any() else None
 
 
 def normalise(log_p_star: Array) -> tuple[Array, Array]:
@@ -185,7 +219,7 @@ def weigh_and_absorb(expected: Expected, plots: Plots, choose: Choice) -> tuple[
     """``update``, and as third the logarithm of the weight sum of the filter that associates, shape (...)."""
     plots = within_reach(expected, plots)
     w, log_pdf, inside = compared(expected, plots)
-    q, log_q_bar = choose(log_weights(expected, log_pdf[-1], inside, plots.log_relative))
+    q, log_q_bar = choose(log_weights(expected, log_pdf[-1], inside, plots))
     # Eq. (13): with log q_j = log (weight j) - log q_bar, only the densities of the plots do not cancel.
     log_p_bar = log_q_bar + np.vecdot(q[..., 1:], log_pdf[0] - log_pdf[-1])
     return absorb(expected, w, q), log_p_bar, log_q_bar
@@ -214,7 +248,7 @@ def weights_alone(expected: Expected, plots: Plots) -> Array:
     """Log p*_j (Eq. 6) in the filter that associates, tracks taken one by one, shape (..., 1 + M)."""
     honest = expected._replace(z=expected.z[-1:], whitener=expected.whitener[-1:], log_peak=expected.log_peak[-1:])
     _, log_pdf, inside = compared(honest, plots)
-    return log_weights(expected, log_pdf[0], inside, plots.log_relative)
+    return log_weights(expected, log_pdf[0], inside, plots)
 
 
 def innovations(z: Array, expected: Array, angular: tuple[int, ...]) -> Array:
@@ -228,7 +262,8 @@ def innovations(z: Array, expected: Array, angular: tuple[int, ...]) -> Array:
 def within_reach(expected: Expected, plots: Plots) -> Plots:
     """The plots inside the box around each track's gate, where that is less work than to look at all of them.
 
-    With all plots the result would be the same, in a time that grows with the product of tracks and plots.
+    With all plots the result would be the same, in a time that grows with the product of tracks and plots. Of tracks
+    at the edge of the field of view, it is worked out how probably they are inside if a plot is theirs (Eq. 6a).
 
     Args:
         expected: the tracks, batch axes (F, ...).
@@ -237,6 +272,57 @@ def within_reach(expected: Expected, plots: Plots) -> Plots:
     Returns:
         plots with the batch axes of the tracks, or of the scans; as they are where they were chosen already.
     """
+    return in_view(expected, _near(expected, plots))
+
+
+def in_view(expected: Expected, plots: Plots) -> Plots:
+    """Plots with the probability of each track at the edge of the field of view to be inside, if a plot is its own.
+
+    The density of such a track after plot j is ``N(x; x_j, P_j)``, cut off at the edge, so the plot weighs (Eq. 6a)
+
+        (p_d/rho_f) N(z_j; H x, S_k) P(inside | x_j, P_j)
+
+    Args:
+        expected: the tracks, batch axes (F, ...).
+        plots: of the scan.
+
+    Returns:
+        plots; as they are where no track is at the edge, or where that was worked out already.
+    """
+    if expected.edge is None or plots.log_in_view is not None:
+        return plots
+    return plots._replace(log_in_view=_log_in_view(expected, expected.edge, plots))
+
+
+def _log_in_view(expected: Expected, edge: BoolArray, plots: Plots) -> Array:
+    """Logarithms for the pairs of track and plot that are in the gate; 0 elsewhere, shape (..., M)."""
+    assert expected.view is not None
+    many, m = plots.z.shape[-2:]
+    batch = np.broadcast_shapes(edge.shape, plots.z.shape[:-2])
+    rows = np.broadcast_to(edge, batch)
+
+    def chosen(array: Array, *size: int) -> Array:
+        picked: Array = np.broadcast_to(array, (*batch, *size))[rows]
+        return picked
+
+    n = expected.density.x.shape[-1]
+    nu = innovations(chosen(plots.z, many, m), chosen(expected.z[-1], m)[:, None], expected.angular)
+    valid = np.broadcast_to(np.True_ if plots.valid is None else plots.valid, (*batch, many))[rows]
+    w = times_transposed(np.where(valid[..., None], nu, 0.0), chosen(expected.whitener[-1], m, m))
+    row, plot = np.nonzero((squared_norm(w) <= expected.gate) & valid)
+    x, W, P = (
+        chosen(array[-1], *size)[row]
+        for array, size in ((expected.density.x, (n,)), (expected.W, (n, m)), (expected.P_hit, (n, n)))
+    )
+    inside = expected.view.probability_inside(Gaussian(x + np.matvec(W, w[row, plot]), P))
+    chances, log_in_view = np.zeros((int(rows.sum()), many)), np.zeros((*batch, many))
+    chances[row, plot] = _log(inside)
+    log_in_view[rows] = chances
+    return log_in_view
+
+
+def _near(expected: Expected, plots: Plots) -> Plots:
+    """``within_reach``, as far as it is for boxes to say."""
     if plots.number is not None:
         return plots
     pairs = plots.z.shape[-2] * expected.z[0, ..., 0].size
@@ -301,21 +387,25 @@ def gate_threshold(p_g: float, m: int) -> float:
     return float(2.0 * gammaincinv(m / 2.0, p_g))
 
 
-def log_weights(expected: Expected, log_pdf: Array, inside: BoolArray, log_relative: Array | None = None) -> Array:
-    """Logarithms of the unnormalised weights p*_j (Eq. 6), j = 0 the missed detection.
+def log_weights(expected: Expected, log_pdf: Array, inside: BoolArray, plots: Plots) -> Array:
+    """Logarithms of the unnormalised weights p*_j (Eq. 6, 6a), j = 0 the missed detection.
 
     Args:
         expected: the tracks.
         log_pdf: log N(z_j; H x, S_k) of the filter that associates, shape (..., M).
         inside: plots that count, shape (..., M).
-        log_relative: density of false plots at the plots, see ``Plots``.
+        plots: how dense false ones are there, and whether a track that has one is in view, see ``Plots``.
 
     Returns:
         log p*_j, shape (..., 1 + M); -inf for impossible hypotheses.
     """
     weights = np.empty((*log_pdf.shape[:-1], 1 + log_pdf.shape[-1]))
     weights[..., 0] = expected.log_miss
-    log_hit = expected.log_hit[..., None] if log_relative is None else expected.log_hit[..., None] - log_relative
+    log_hit = expected.log_hit[..., None]
+    if plots.log_relative is not None:
+        log_hit = log_hit - plots.log_relative
+    if plots.log_in_view is not None:
+        log_hit = log_hit + plots.log_in_view
     weights[..., 1:] = np.where(inside, log_hit + log_pdf, -np.inf)
     return weights
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaln
 
-from common.estimation.association import innovations, log_weights
+from common.estimation.association import in_view, innovations, log_weights
 from common.estimation.batch import take
 from common.estimation.detection import Notch
 from common.estimation.extraction import SensorScan, expected_of, in_order, weighed
@@ -208,7 +208,7 @@ def extract_cluster(
 def _branched(density: Gaussian, scan: SensorScan, gate_probability: float) -> _Branches:
     """Every sub-track with every plot."""
     expected = expected_of(Gaussian(density.x[None], density.P[None]), scan, gate_probability)
-    plots = weighed(scan)
+    plots = in_view(expected, weighed(scan))
     if isinstance(scan.sensor.detection, Notch):
         log_p_star, (x, P) = hypotheses(expected, plots, scan.sensor.detection, scan.stand)
         return _Branches(log_p_star[0], Gaussian(x[0], P[0]))
@@ -222,7 +222,7 @@ def _branched(density: Gaussian, scan: SensorScan, gate_probability: float) -> _
     (x, P), P_hit = density, expected.P_hit[0]
     hit = x[:, None] + np.matvec(expected.W[0, :, None], w)
     return _Branches(
-        log_weights(expected, log_pdf, inside, plots.log_relative),
+        log_weights(expected, log_pdf, inside, plots),
         Gaussian(
             np.concatenate((x[:, None], hit), axis=1),
             np.concatenate((P[:, None], np.repeat(P_hit[:, None], hit.shape[1], axis=1)), axis=1),

@@ -211,8 +211,8 @@ def extract(
 def expected_of(density: Gaussian, scan: SensorScan, gate_probability: float) -> Expected:
     """What the sensor will see of Gaussians, shapes (1, ..., n), (1, ..., n, n), if it has no clutter notch."""
     sensor = scan.sensor.without_notch
-    p_d = sensor.detection_probability(Gaussian(density.x[0], density.P[0]), scan.stand, scan.center)
-    clutter = Clutter(p_d, np.array(sensor.log_rho_f), gate_probability)
+    p_d = sensor.detection_probability(Gaussian(density.x[0], density.P[0]), scan.stand)
+    clutter = Clutter(p_d, np.array(sensor.log_rho_f), gate_probability, sensor.view(scan.center))
     return expect(density, sensor.measurement.linearise(density, scan.stand), clutter)
 
 
@@ -240,5 +240,5 @@ def _of(plots: Plots, rows: BoolArray) -> Plots:
     shared = int(np.prod(plots.z.shape[:-2])) == 1
     if shared:
         return plots
-    z, valid, relative, _ = plots
+    z, valid, relative, *_ = plots
     return Plots(z[rows], None if valid is None else valid[rows], None if relative is None else relative[rows])

@@ -80,6 +80,23 @@ class FieldOfView(Protocol):
         ...
 
 
+class View(NamedTuple):
+    """A field of view where it is at the time of a scan.
+
+    Attributes:
+        shape: of it.
+        center: of it [m], shape (..., d).
+    """
+
+    shape: FieldOfView
+    center: Array
+
+    def probability_inside(self, state: Gaussian) -> Array:
+        """Probability that states lie inside, position first, shapes (..., n), (..., n, n) to (...)."""
+        d = self.center.shape[-1]
+        return self.shape.probability_inside(Gaussian(state.x[..., :d], state.P[..., :d, :d]), self.center)
+
+
 class Everywhere(NamedTuple):
     """A sensor that sees every track; its plots come from a square or cube.
 

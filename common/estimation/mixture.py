@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import Expected, Plots, innovations, within_reach
+from common.estimation.association import Expected, Plots, in_view, innovations, within_reach
 from common.estimation.batch import take
 from common.estimation.gating import IntArray
 from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, quadratic, squared_norm, symmetric
@@ -119,7 +119,7 @@ def step(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction)
 
 def step_traced(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction) -> tuple[Mixture, Ancestry]:
     """``step``, and where the components come from."""
-    tracks = len(prior.log_w)
+    tracks, plots = len(prior.log_w), in_view(expected, plots)
     hits = _hits(prior, expected, plots)
     branches = _joined(prior, _missed(prior, expected), _hit(prior, expected, plots, hits))
     rows = _survivors(branches, reduction.prune, tracks)
@@ -230,6 +230,8 @@ def _hit(prior: Mixture, expected: Expected, near: Plots, hits: tuple[IntArray, 
     log_p = peak - 0.5 * squared_norm(w) + np.broadcast_to(expected.log_hit, prior.log_w.shape)[track, component, None]
     if near.log_relative is not None:
         log_p -= np.broadcast_to(near.log_relative, pairs)[hits][:, None]
+    if near.log_in_view is not None:
+        log_p += np.broadcast_to(near.log_in_view, pairs)[hits][:, None]
     log_w, log_g = prior.log_w[track, component] + log_p[:, -1], prior.log_g[track, component] + log_p[:, 0]
     return _Branches(track, log_w, log_g, x + np.matvec(W, w), P)
 

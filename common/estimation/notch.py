@@ -27,6 +27,7 @@ from common.estimation.association import (
     Filtered,
     Plots,
     compared,
+    in_view,
     log_weights,
     normalise,
 )
@@ -64,8 +65,9 @@ def hypotheses(expected: Expected, plots: Plots, notch: Notch, stand: Array) -> 
     Returns:
         for each filter; which plots lie in the gate is for the last one to say.
     """
+    plots = in_view(expected, plots)
     w, log_pdf, inside = compared(expected, plots)
-    log_p_star = np.stack([log_weights(expected, pdf, inside, plots.log_relative) for pdf in log_pdf])
+    log_p_star = np.stack([log_weights(expected, pdf, inside, plots) for pdf in log_pdf])
     plain = _plain(expected, np.where(inside[..., None], w, 0.0))
     return _with_notch(log_p_star, plain, -np.expm1(expected.log_miss), notch, stand)
 

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from common.estimation.detection import Constant, Detection, Notch
-from common.estimation.field_of_view import FieldOfView
+from common.estimation.field_of_view import AllAround, Everywhere, FieldOfView, View
 from common.estimation.gaussian import Array, BoolArray, Gaussian
 from common.estimation.pose import SensorPose
 from common.estimation.visibility import Visibility
@@ -198,21 +198,23 @@ class Sensor(NamedTuple):
         """
         return self.measurement.log_stretch(z)
 
-    def detection_probability(self, state: Gaussian, stand: Array, center: Array) -> Array:
-        """Mean detection probability, 0 outside the field of view, the two taken for independent.
+    def view(self, center: Array) -> View | None:
+        """The field of view where its center [m] is, shape (..., d); None: every target is in it."""
+        if isinstance(self.field_of_view, Everywhere | AllAround):
+            return None
+        return View(self.field_of_view, center)
+
+    def detection_probability(self, state: Gaussian, stand: Array) -> Array:
+        """Mean detection probability in the field of view.
 
         Args:
             state: predicted states, shapes (..., n), (..., n, n), position first.
             stand: where the sensor stands [m], shape (d,).
-            center: of the field of view [m], shape (..., d).
 
         Returns:
-            detection probabilities, shape (...); 0 where the sensor cannot see.
+            detection probabilities, shape (...).
         """
-        d = center.shape[-1]
-        position = Gaussian(state.x[..., :d], state.P[..., :d, :d])
-        inside = self.field_of_view.probability_inside(position, center)
-        return self.p_d * inside * self.detection.mean_share(state, stand)
+        return self.p_d * self.detection.mean_share(state, stand)
 
     def draw_seen(self, rng: np.random.Generator, x: Array, stand: Array, center: Array) -> BoolArray:
         """Draw which targets are detected, shape (targets, n) to (targets,)."""

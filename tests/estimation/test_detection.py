@@ -95,12 +95,11 @@ def test_a_batch_equals_the_loop(draw: Draw, model: Detection, shape: tuple[int,
         assert shares[i] == pytest.approx(float(model.share(x[i], stand)), abs=1e-12)
 
 
-def test_a_sensor_weights_it_with_p_d_and_its_field_of_view() -> None:
+def test_a_sensor_weights_it_with_p_d() -> None:
     track = Gaussian(np.array([1000.0, 0.0, 0.0, 0.0]), np.diag([1e4, 1e4, 9.0, 9.0]))
     sensor = Sensor(Position((1.0, 1.0), 4), 0.8, 1.0, Disc(1000.0, 2), NOTCH)
-    p_d = sensor.detection_probability(track, np.zeros(2), np.zeros(2))
-    inside = Disc(1000.0, 2).probability_inside(Gaussian(track.x[:2], track.P[:2, :2]), np.zeros(2))
-    assert p_d == pytest.approx(0.8 * float(inside) * float(NOTCH.mean_share(track, np.zeros(2))))
+    p_d = sensor.detection_probability(track, np.zeros(2))
+    assert p_d == pytest.approx(0.8 * float(NOTCH.mean_share(track, np.zeros(2))))
 
 
 @pytest.mark.parametrize("model", [SWERLING, NOTCH])

@@ -180,7 +180,7 @@ def test_the_mean_probability_is_that_of_the_weights(draw: Draw) -> None:
     """1 - p*_0 with the notch is what the sensor says of itself: its network's p_bar and this filter's agree."""
     tracks = one(draw(np.random.default_rng(7), (), 4))
     sensor = Sensor(SENSOR, P_D, 1.0, Everywhere(1e3, 2), NOTCH)
-    p_d = sensor.detection_probability(Gaussian(tracks.x[0], tracks.P[0]), FAR, np.zeros(2))
+    p_d = sensor.detection_probability(Gaussian(tracks.x[0], tracks.P[0]), FAR)
     found = hypotheses(expected(tracks), Plots(np.empty((0, 2))), NOTCH, FAR)
     assert 1.0 - np.exp(found.log_p_star[0, 0]) == pytest.approx(float(p_d), rel=1e-12)
 

@@ -8,11 +8,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
+from common.limits import FULL_CIRCLE, MAX_SECONDS, ZENITH
+
 NS_PER_S = 1_000_000_000
-#: Times from the epoch, so that nanoseconds since 1970 fit into 64 bits.
-MAX_SECONDS = 4e9
-#: Written with few digits, 2 pi and pi / 2 may come out a little too large.
-_FULL_CIRCLE, _ZENITH = 2.0 * np.pi + 0.005, 0.5 * np.pi + 0.005
 
 
 class Model(BaseModel):
@@ -64,13 +62,13 @@ def _angle(value: float) -> float:
 
 
 def _span(value: float) -> float:
-    if not 0.0 < value <= _FULL_CIRCLE:
+    if not 0.0 < value <= FULL_CIRCLE:
         raise ValueError(f"{value:g} is no span of azimuths in radians (above 0, up to 2 pi)")
     return min(value, 2.0 * np.pi)
 
 
 def _elevation(value: float) -> float:
-    if not -_ZENITH <= value <= _ZENITH:
+    if not -ZENITH <= value <= ZENITH:
         raise ValueError(f"{value:g} is no elevation in radians (-pi/2 to pi/2)")
     return float(np.clip(value, -0.5 * np.pi, 0.5 * np.pi))
 

@@ -22,6 +22,7 @@ from common.estimation.sector import Sector
 from common.estimation.sensing import Measurement, Position, Sensor
 from common.estimation.sigma_points import SigmaPoint
 from common.estimation.visibility import Visibility
+from common.limits import PlotLimits, plot_limits
 from common.quantities import (
     WITHIN_RANGE,
     Angle,
@@ -316,6 +317,11 @@ class SensorConfig(Model):
         if self.kind == "polar-doppler":
             return (*_NUMBERS["polar"][: m - 1], "range rate")
         return _NUMBERS[self.kind][:m]
+
+    @property
+    def limits(self) -> PlotLimits:
+        """What the numbers of a plot can be."""
+        return plot_limits(self.numbers)
 
 
 def sensor_faults(sensor: Mapping[str, Any], dimensions: int, where: str) -> Iterator[str]:

@@ -234,7 +234,7 @@ class Center:
         heard = self._fitting(report, number)
         if isinstance(heard, str):
             return state.refuse(report.sensor, heard), []
-        return self._accept(state, heard, now_ns)
+        return self._accept(_left_out(state, report, heard.report), heard, now_ns)
 
     def _misplaced(self, state: State, report: Report | Picked, now_ns: int) -> Refusal | None:
         """Why a report is not the next one of a sensor of this network, if it is not; its content does not matter."""
@@ -252,9 +252,12 @@ class Center:
         return "time too far ahead" if self._ahead(state.clock, report.time_ns, now_ns) else None
 
     def _fitting(self, report: Report | Picked, number: int) -> AnyHeard | Refusal:
-        """A report taken apart, or why it cannot be computed with."""
-        fault = self.initiation.fault(report, number) if self.initiation else None
-        return self.fuser.heard(report) if fault is None else fault
+        """A report taken apart, without the tracks and plots that cannot be used, or why none of it can be."""
+        if self.initiation:
+            if (fault := self.initiation.fault(report, number)) is not None:
+                return fault
+            report = self.initiation.usable(report, number)
+        return self.fuser.heard(report)
 
     def _ahead(self, clock: Clock | None, time_ns: int, now_ns: int) -> bool:
         """Whether a time lies farther in the future than the window: one wrong clock must not make all others late."""
@@ -472,6 +475,15 @@ def given(scenario: Scenario, fuser: AnyFuser) -> Picture:
         np.array([scenario.to_ns(hypothesis.start) for hypothesis in scenario.hypotheses]),
         Gaussian(np.array([prior.x for prior in priors]), np.array([prior.P for prior in priors])),
     )
+
+
+def _left_out(state: State, came: Report | Picked, used: Report | Picked) -> State:
+    """The state with the tracks and plots counted that a report has lost because they cannot be computed with."""
+    state = state.counted("unusable_tracks", len(came.ids) - len(used.ids))
+    plots = len(came.unclaimed) - len(used.unclaimed)
+    if isinstance(came, Picked) and isinstance(used, Picked):
+        plots += len(came.z) - len(used.z)
+    return state.counted("unusable_plots", plots)
 
 
 def _unclaimed(reports: Mapping[int, AnyHeard]) -> list[Unclaimed]:

@@ -10,7 +10,17 @@ import numpy as np
 
 from common.config import Scenario
 from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, Product, Whitened, log_sum_exp, moments, whitener
+from common.estimation.gaussian import (
+    Array,
+    BoolArray,
+    Gaussian,
+    Product,
+    Whitened,
+    are_positive_definite,
+    log_sum_exp,
+    moments,
+    whitener,
+)
 from common.estimation.imm import Imm, Modes, predict_modes
 from common.estimation.mixture_product import multiply_mixtures
 from common.estimation.motion import Motion
@@ -18,13 +28,11 @@ from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import DELETED, TENTATIVE, Thresholds
+from common.limits import MAX_ESTIMATE
 from common.messages import Decision, IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
 from fusion_center.picture import Backup, Picture, common, decided
 from fusion_center.refusal import Refusal
-
-#: No position or speed in m, m/s is larger, and no standard deviation smaller than its inverse.
-_LARGEST = 1e15
 
 
 class Heard(NamedTuple):
@@ -175,23 +183,21 @@ class Fuser:
         )
 
     def heard(self, report: Report | Picked) -> Heard | Refusal:
-        """A report taken apart, or why it cannot be computed with."""
+        """A report taken apart, without the tracks that cannot be computed with, or why none can be."""
         if not isinstance(report, Report):
             return "another fusion mode"
         if report.x.shape[-1] != self.motion.n:
             return "wrong dimensions"
         if (report.terms > self.terms).any():
             return "too many terms"
-        # Positive definite, and far from where squares overflow.
+        # Far from where squares overflow.
         variances = report.P.diagonal(axis1=-2, axis2=-1)
-        if (variances <= 0.0).any():
-            return "covariance not positive definite"
-        if (np.abs(report.x) > _LARGEST).any() or (variances > _LARGEST**2).any() or (variances < _LARGEST**-2).any():
-            return "numbers out of range"
+        inside = (np.abs(report.x) <= MAX_ESTIMATE) & (variances <= MAX_ESTIMATE**2) & (variances >= MAX_ESTIMATE**-2)
+        report = _with_terms(report, np.asarray(inside.all(axis=-1)))
         try:
             return Heard.of(report)
         except np.linalg.LinAlgError:
-            return "covariance not positive definite"
+            return Heard.of(_with_terms(report, are_positive_definite(report.P)))
 
     def backup(self, picture: Picture, number: int) -> Backup:
         """What a sensor that joins goes on from: its last factor where it reported one, else the prior.
@@ -362,6 +368,22 @@ class Fuser:
             )
             network_P[:, number] = shrink(P, linear.H, linear.R)
         return network_P
+
+
+def _with_terms(report: Report, usable: BoolArray) -> Report:
+    """A report of the tracks all of whose terms are usable, shape (N,)."""
+    if usable.all():
+        return report
+    track = np.repeat(np.arange(len(report.ids)), report.terms)
+    kept = np.bincount(track[~usable], minlength=len(report.ids)) == 0
+    rows = kept[track]
+    return report._replace(
+        ids=report.ids[kept],
+        terms=report.terms[kept],
+        log_g=report.log_g[rows],
+        x=report.x[rows],
+        P=report.P[rows],
+    )
 
 
 def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:

@@ -18,13 +18,11 @@ from common.estimation.pose import SensorPose
 from common.estimation.sensing import Measurement, Sensor
 from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE
 from common.initiation_config import InitiationConfig
+from common.limits import MAX_VALUE, PlotLimits, is_possible
 from common.messages import Decision, IntArray, Picked, Report
 from common.quantities import NS_PER_S
 from fusion_center.picture import Picture
 from fusion_center.refusal import Refusal
-
-#: No plot or place is farther [m].
-_LARGEST = 1e9
 
 
 class Unclaimed(NamedTuple):
@@ -65,11 +63,13 @@ class Initiation:
         config: as the scenario says.
         motion: how targets move.
         sensors: models of the sensors.
+        limits: of their plots.
     """
 
     config: InitiationConfig
     motion: Motion
     sensors: tuple[Sensor, ...]
+    limits: tuple[PlotLimits, ...]
 
     @classmethod
     def of(cls, scenario: Scenario) -> Initiation | None:
@@ -77,18 +77,26 @@ class Initiation:
         if scenario.initiation is None:
             return None
         motion = scenario.motion.build()
-        return cls(scenario.initiation, motion, tuple(sensor.build(motion) for sensor in scenario.sensors))
+        return cls(
+            scenario.initiation,
+            motion,
+            tuple(sensor.build(motion) for sensor in scenario.sensors),
+            tuple(sensor.limits for sensor in scenario.sensors),
+        )
 
     def fault(self, report: Report | Picked, number: int) -> Refusal | None:
         """Why the unclaimed plots of a report are not such as its sensor gives, or tell of no positions; None: fine."""
         z, stand, measurement = report.unclaimed, report.position, self.sensors[number].measurement
-        if not len(z):
-            return None
         d = self.motion.dimensions
-        if (z.shape[1], len(stand)) != (measurement.m, d) or measurement.m < d:
-            return "unclaimed plots of another sensor"
-        near = all((np.abs(numbers) < _LARGEST).all() for numbers in (z, stand, report.velocity))
-        return None if near else "unclaimed plots out of range"
+        fits = not len(z) or ((z.shape[1], len(stand)) == (measurement.m, d) and measurement.m >= d)
+        return None if fits else "unclaimed plots of another sensor"
+
+    def usable(self, report: Report | Picked, number: int) -> Report | Picked:
+        """A report without fault, without the unclaimed plots that its sensor cannot mean, seen from where it stood."""
+        if not len(report.unclaimed):
+            return report
+        usable = self.limits[number].contain(report.unclaimed) & is_possible(report.pose)
+        return report if usable.all() else report._replace(unclaimed=report.unclaimed[usable])
 
     def seeds(self, picture: Picture, now: Sequence[Unclaimed], before: Sequence[Unclaimed]) -> Gaussian:
         """What starts at a measurement time.
@@ -187,7 +195,7 @@ class Initiation:
     def _slow(self, density: Gaussian) -> BoolArray:
         """No faster than a target can be, as far as that is known, and somewhere."""
         d = self.motion.dimensions
-        somewhere = (density.P.diagonal(axis1=-2, axis2=-1)[:, :d] < _LARGEST**2).all(axis=-1)
+        somewhere = (density.P.diagonal(axis1=-2, axis2=-1)[:, :d] < MAX_VALUE**2).all(axis=-1)
         speed = np.linalg.vector_norm(density.x[:, d : 2 * d], axis=-1)
         known = np.minimum(density.P.diagonal(axis1=-2, axis2=-1)[:, d : 2 * d].sum(axis=-1), self.config.fastest**2)
         slow: BoolArray = somewhere & (speed <= self.config.fastest + np.sqrt(known))

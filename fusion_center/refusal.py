@@ -17,10 +17,8 @@ Refusal: TypeAlias = Literal[
     "another fusion mode",
     "wrong dimensions",
     "too many terms",
-    "numbers out of range",
-    "covariance not positive definite",
+    "position out of range",
     "unclaimed plots of another sensor",
-    "unclaimed plots out of range",
 ]
 
 #: How often each sensor was refused for each reason.

@@ -17,6 +17,7 @@ from common.estimation.mixture import Mixture
 from common.estimation.pose import SensorPose
 from common.estimation.sensing import Sensor
 from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds
+from common.limits import is_possible
 from common.local_filter import SUREST, LocalFilter
 from common.messages import Decision, IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
@@ -141,13 +142,16 @@ class SelectedFuser:
         )
 
     def heard(self, report: Report | Picked) -> HeardPlots | Refusal:
-        """A report laid out, or why it cannot be computed with."""
+        """A report laid out, without the plots that its sensor cannot mean, or why none of it can be used."""
         if not isinstance(report, Picked):
             return "another fusion mode"
         config, sensor = next(entry for entry in self.sensors if entry[0].name == report.sensor)
         stand = config.stand(self.filter.motion.dimensions)
         if report.z.shape[-1] != sensor.measurement.m or report.position.shape != stand.shape:
             return "wrong dimensions"
+        if not is_possible(report.pose):
+            return "position out of range"
+        report = _with_plots(report, config.limits.contain(report.z))
         valid = np.arange(int(report.plots.max(initial=0))) < report.plots[:, None]
         z, number = np.zeros((*valid.shape, report.z.shape[-1])), np.zeros(valid.shape, np.intp)
         z[valid], number[valid] = report.z[report.which], report.which
@@ -244,6 +248,19 @@ class SelectedFuser:
         for old, new in zip(whole.density, part.density, strict=True):
             old[:, rows] = new
         return whole
+
+
+def _with_plots(report: Picked, usable: BoolArray) -> Picked:
+    """A report with only its usable plots, shape (M,)."""
+    if usable.all():
+        return report
+    kept = usable[report.which]
+    track = np.repeat(np.arange(len(report.ids)), report.plots)
+    return report._replace(
+        plots=np.bincount(track[kept], minlength=len(report.ids)),
+        which=(np.cumsum(usable) - 1)[report.which[kept]],
+        z=report.z[usable],
+    )
 
 
 def _wide(mixture: Mixture, size: int) -> Mixture:

@@ -149,7 +149,8 @@ class CenterShell:
         for kind, old, new in zip(now.counts._fields, before.counts, now.counts, strict=True):
             if new > old:
                 why = ": ".join([*(reasons if kind == "refused" else []), _summary(event)])
-                self.complaints.add(f"{kind} {what}", why, new - old, **about)
+                named = kind.replace("_", " ") if kind.startswith("unusable") else f"{kind} {what}"
+                self.complaints.add(named, why, new - old, **about)
 
     def _say_presence(self, name: str, alive: bool) -> None:
         if name not in self._center.names:

@@ -148,12 +148,17 @@ class Counts(NamedTuple):
         too_late: dropped, older than the window.
         repeated: dropped, had arrived before.
         refused: dropped, do not fit this network.
+        unusable_tracks: left out of reports, of which the rest was worked in: a factor is no Gaussian density, or
+            beyond ``MAX_ESTIMATE``.
+        unusable_plots: left out of reports, of which the rest was worked in: no sensor can mean them.
     """
 
     late: int = 0
     too_late: int = 0
     repeated: int = 0
     refused: int = 0
+    unusable_tracks: int = 0
+    unusable_plots: int = 0
 
 
 class State(NamedTuple):
@@ -213,9 +218,11 @@ class State(NamedTuple):
         """The state with another opinion of a sensor."""
         return self._replace(members=(*self.members[:number], member, *self.members[number + 1 :]))
 
-    def counted(self, what: str) -> State:
-        """The state with one more report of a kind of ``Counts``."""
-        return self._replace(counts=self.counts._replace(**{what: getattr(self.counts, what) + 1}))
+    def counted(self, what: str, more: int = 1) -> State:
+        """The state with so many more of a kind of ``Counts``."""
+        if not more:
+            return self
+        return self._replace(counts=self.counts._replace(**{what: getattr(self.counts, what) + more}))
 
     def refuse(self, sensor: str, refusal: Refusal) -> State:
         """The state with one more refused report or request of a sensor."""

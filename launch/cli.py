@@ -112,7 +112,8 @@ def replay(
     final: dict[int, str] = {}
     scans = all_scans(loaded, plots=plots)
     warn(loaded, scans, recording_of(loaded, plots))
-    for message in Centralised.of(loaded).run(scans) if centralised else Replay(loaded, scans).run():
+    network = Replay(loaded, scans)
+    for message in Centralised.of(loaded).run(scans) if centralised else network.run():
         if isinstance(message, Tracks) and as_json:
             sys.stdout.writelines(line + "\n" for line in lines.of(message))
         elif isinstance(message, Tracks):
@@ -124,6 +125,8 @@ def replay(
             print(f"{time_s:8.2f} s  track {message.track} {message.kind}, log LR {message.log_lr:+.2f}")
     if not as_json:
         print("\n".join(text for _, text in sorted(final.items())))
+    for what, count in network.left_out.items():
+        print(f"{loaded.name}: {count} {what}", file=sys.stderr)
 
 
 @app.command

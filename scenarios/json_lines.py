@@ -7,18 +7,17 @@ from __future__ import annotations
 
 import gzip
 import json
+import sys
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
 from common.errors import WaldnetError
-from common.quantities import MAX_SECONDS
+from common.limits import MAX_ID, MAX_SECONDS, MAX_VALUE
 
 T = TypeVar("T")
 
-#: No number is larger; NaN and infinities are none.
-_LARGEST = 1e15
 #: So many faults of a file are listed, the others counted.
 _LISTED = 20
 _GZIP = b"\x1f\x8b"
@@ -115,13 +114,13 @@ def identity(value: Any, where: str) -> int:
     Raises:
         ValueError: for anything else.
     """
-    if not isinstance(value, int) or isinstance(value, bool) or abs(value) > _LARGEST:
-        raise ValueError(f"{where}: {value!r} is not a whole number between -{_LARGEST:g} and {_LARGEST:g}")
+    if not isinstance(value, int) or isinstance(value, bool) or abs(value) > MAX_ID:
+        raise ValueError(f"{where}: {value!r} is not a whole number between -{MAX_ID:g} and {MAX_ID:g}")
     return value
 
 
-def numbers(value: Any, sizes: Sequence[int], where: str) -> list[float]:
-    """A list of finite numbers, as long as one of the sizes.
+def numbers(value: Any, sizes: Sequence[int], where: str, largest: float = MAX_VALUE) -> list[float]:
+    """A list of finite numbers, as long as one of the sizes, none beyond ``largest``.
 
     Raises:
         ValueError: for anything else.
@@ -129,8 +128,11 @@ def numbers(value: Any, sizes: Sequence[int], where: str) -> list[float]:
     if not isinstance(value, list) or len(value) not in sizes or not all(map(_is_number, value)):
         expected = " or ".join(map(str, sizes))
         raise ValueError(f"{where}: {value!r} is not a list of {expected} finite numbers")
+    for number in value:
+        if abs(number) > largest:
+            raise ValueError(f"{where}: {number!r} is not between -{largest:g} and {largest:g}")
     return value
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= _LARGEST
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

@@ -9,6 +9,7 @@ from.
 from __future__ import annotations
 
 import json
+import sys
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -20,18 +21,13 @@ from common.config import Scenario, SensorConfig
 from common.errors import PlotsError, PlotsWarning
 from common.estimation.gaussian import Array
 from common.estimation.pose import SensorPose
+from common.limits import FULL_CIRCLE, MAX_PLOTS, MAX_VALUE
 from common.messages import Scan
 from common.quantities import NS_PER_S
 from scenarios.json_lines import numbers, read_lines, seconds
 
 #: What a line may say of the sensor.
 _POSE = ("position", "velocity", "heading")
-#: Numbers of a plot that cannot be just any: degrees, for example, are soon found out.
-_RANGES = {
-    "range": (0.0, np.inf, "distance"),
-    "azimuth": (-2.0 * np.pi, 2.0 * np.pi, "angle in radians"),
-    "elevation": (-0.5 * np.pi, 0.5 * np.pi, "elevation in radians"),
-}
 
 
 def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
@@ -134,10 +130,14 @@ def _parse(entry: dict[str, Any], scenario: Scenario) -> Scan | None:
     plots = entry["plots"]
     if not isinstance(plots, list):
         raise ValueError(f"plots: {plots!r} is not a list of plots")
-    m = len(sensor.sigma)
-    z = [_vector(plot, m, f"plots.{j}") for j, plot in enumerate(plots)]
+    if len(plots) > MAX_PLOTS:
+        raise ValueError(f"plots: has {len(plots)} plots, expected at most {MAX_PLOTS}")
+    m, limits = len(sensor.sigma), sensor.limits
+    z = [_vector(plot, m, f"plots.{j}", sys.float_info.max) for j, plot in enumerate(plots)]
     for j, plot in enumerate(z):
-        _check_range(plot, sensor.numbers, f"plots.{j}")
+        # Degrees, for example, or a number that stands for "not available".
+        if fault := limits.fault(plot):
+            raise ValueError(f"plots.{j}: {fault}")
     seen = np.array(z).reshape(-1, m)
     if sensor.azimuth == "heading":
         seen = _turned(seen, sensor, pose.heading)
@@ -156,7 +156,7 @@ def _pose(entry: dict[str, Any], sensor: SensorConfig, d: int) -> SensorPose:
 
 
 def _is_angle(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= 2.0 * np.pi
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= FULL_CIRCLE
 
 
 def _turned(z: Array, sensor: SensorConfig, angle: float) -> Array:
@@ -166,12 +166,5 @@ def _turned(z: Array, sensor: SensorConfig, angle: float) -> Array:
     return z
 
 
-def _vector(value: Any, size: int, where: str) -> Array:
-    return np.array(numbers(value, (size,), where), dtype=np.float64)
-
-
-def _check_range(plot: Array, numbers: tuple[str, ...], where: str) -> None:
-    for value, name in zip(plot, numbers, strict=True):
-        low, high, meaning = _RANGES.get(name, (-np.inf, np.inf, ""))
-        if not low <= value <= high:
-            raise ValueError(f"{where}: {name} {value:g} is no {meaning}")
+def _vector(value: Any, size: int, where: str, largest: float = MAX_VALUE) -> Array:
+    return np.array(numbers(value, (size,), where, largest), dtype=np.float64)

@@ -263,7 +263,10 @@ class NodeShell:
 
     def _process(self, scan: Scan) -> None:
         self._position += 1
+        unusable = self._state.unusable
         self._state, report = self._tracker.scan(self._state, scan, self._next_ns())
+        if more := self._state.unusable - unusable:
+            self.complaints.add("unusable plots", "left out: numbers that no sensor can mean", more)
         self._publish(report)
         self._reported_s = time.monotonic()
         if self._publishers[self._keys.plots(self._name)].has_listeners and not self._publish(scan):

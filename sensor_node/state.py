@@ -113,6 +113,7 @@ class State(NamedTuple):
         begun: tracks that began at a center whose start message has not come yet.
         maps: of each sensor's false plots; None for sensors that have none.
         ready: worked out ahead for the next scan, or None. It saves time and changes nothing.
+        unusable: number of plots left out so far because no sensor can mean them.
     """
 
     epoch: int
@@ -127,6 +128,7 @@ class State(NamedTuple):
     begun: tuple[Begin, ...] = ()
     maps: tuple[ClutterMap | None, ...] = ()
     ready: Ready | None = None
+    unusable: int = 0
 
 
 class Schedule(NamedTuple):

@@ -102,9 +102,11 @@ class LocalTracker:
         return state._replace(ready=self._ready(state, time_ns, pose, self.number))
 
     def scan(self, state: State, scan: Scan, next_ns: int) -> tuple[State, Report | Picked]:
-        """Filter one scan and report every track that started before it."""
-        number = next(sight.number for sight in self.sights if sight.config.name == scan.sensor)
-        return self.look(state, Look(scan.time_ns, scan.pose, Plots(scan.z), number), next_ns)
+        """Filter one scan, without the plots that no sensor can mean, and report every track that started before it."""
+        sight = next(sight for sight in self.sights if sight.config.name == scan.sensor)
+        z = scan.z[sight.config.limits.contain(scan.z)]
+        state = state._replace(unusable=state.unusable + len(scan.z) - len(z))
+        return self.look(state, Look(scan.time_ns, scan.pose, Plots(z), sight.number), next_ns)
 
     def look(self, state: State, look: Look, next_ns: int) -> tuple[State, Report | Picked]:
         """``scan``, for plots that may be of every track its own."""

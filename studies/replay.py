@@ -53,6 +53,18 @@ class Replay:
             self._nodes[name], report = self._trackers[name].scan(self._nodes[name], scan, next(self._next[name]))
             yield from self._tell_center(report)
 
+    @property
+    def left_out(self) -> dict[str, int]:
+        """What was not worked in so far: reports, tracks of reports, plots; how many of each, if any."""
+        counts = self._state.counts
+        found = {
+            **{f"reports of {name} refused: {why}": number for (name, why), number in self._state.refused.items()},
+            "tracks left out of reports: no Gaussian density": counts.unusable_tracks,
+            "plots left out: numbers that no sensor can mean": counts.unusable_plots
+            + sum(node.unusable for node in self._nodes.values()),
+        }
+        return {what: count for what, count in found.items() if count}
+
     def _tell_center(self, message: Report | Picked | Join) -> Iterator[Tracks | Decision]:
         self._state, answers = self._center.step(self._state, message, 0)
         for answer in answers:

@@ -179,10 +179,10 @@ def test_a_simulated_world_comes_back_from_its_file(tmp_path: Path) -> None:
     ("sensor", "plot", "fault"),
     [
         ("radar", [1000.0], "plots.0: [1000.0] is not a list of 2 finite numbers"),
-        ("radar", [-1.0, 0.0], "plots.0: range -1 is no distance"),
-        ("radar", [1000.0, 135.0], "plots.0: azimuth 135 is no angle in radians"),
+        ("radar", [-1.0, 0.0], "plots.0: range -1 is no distance in metres (0 to 1e+09)"),
+        ("radar", [1000.0, 135.0], "plots.0: azimuth 135 is no angle in radians (-2 pi to 2 pi)"),
         ("doppler", [1000.0, 1.0], "plots.0: [1000.0, 1.0] is not a list of 3 finite numbers"),
-        ("camera", [90.0], "plots.0: azimuth 90 is no angle in radians"),
+        ("camera", [90.0], "plots.0: azimuth 90 is no angle in radians (-2 pi to 2 pi)"),
     ],
 )
 def test_plots_that_cannot_be_are_refused(tmp_path: Path, sensor: str, plot: list[float], fault: str) -> None:

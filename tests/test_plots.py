@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from common.config import Scenario
 from common.errors import PlotsError
+from common.limits import MAX_VALUE
 from common.messages import Scan
 from scenarios import catalogue
 from scenarios.plots import in_order, read_plots, write_plots
@@ -112,7 +113,7 @@ def test_a_simulated_world_comes_back_from_its_file(tmp_path: Path) -> None:
     assert all_same(read(tmp_path, written(scans)), scans)
 
 
-number = st.floats(-1e15, 1e15)
+number = st.floats(-MAX_VALUE, MAX_VALUE)
 
 
 @settings(deadline=None, derandomize=True, database=None)
@@ -160,6 +161,13 @@ BAD = [
     ({**LINE, "plots": [[1, False]]}, "plots.0: [1, False] is not a list of 2 finite numbers"),
     ({**LINE, "plots": [[1, float("nan")]]}, "plots.0: [1, nan] is not a list of 2 finite numbers"),
     ({**LINE, "plots": [[1, float("inf")]]}, "plots.0: [1, inf] is not a list of 2 finite numbers"),
+    (
+        {**LINE, "plots": [[1, 2], [2147483647.0, 1]]},
+        "plots.1: east 2147483647 is no coordinate in metres (-1e+09 to 1e+09)",
+    ),
+    ({**LINE, "plots": [[1, -3e38]]}, "plots.0: north -3e+38 is no coordinate in metres (-1e+09 to 1e+09)"),
+    ({**LINE, "position": [1.0, 2e9]}, "position: 2000000000.0 is not between -1e+09 and 1e+09"),
+    ({**LINE, "plots": [[1, 2]] * 65536}, "plots: has 65536 plots, expected at most 65535"),
     ({**LINE, "position": [1.0]}, "position: [1.0] is not a list of 2 finite numbers"),
     ({**LINE, "position": 3}, "position: 3 is not a list of 2 finite numbers"),
 ]
@@ -186,8 +194,8 @@ def test_numbers_and_nesting_beyond_all_bounds(tmp_path: Path, line: str) -> Non
 
 
 def test_a_plot_may_be_a_large_whole_number(tmp_path: Path) -> None:
-    (scan,) = read(tmp_path, '{"sensor": "a", "time": 1, "plots": [[1000000000000000, 1]]}')
-    assert scan.z.tolist() == [[1e15, 1.0]]
+    (scan,) = read(tmp_path, '{"sensor": "a", "time": 1, "plots": [[1000000000, 1]]}')
+    assert scan.z.tolist() == [[1e9, 1.0]]
 
 
 def test_a_scan_that_is_there_twice(tmp_path: Path) -> None:

@@ -181,6 +181,19 @@ def _whitener_of_few(P: Array) -> tuple[Array, Array]:
     return W, -np.log(W.diagonal(axis1=-2, axis2=-1)).sum(axis=-1)
 
 
+def are_positive_definite(P: Array) -> BoolArray:
+    """Which covariances ``whitener`` can take apart, shape (N, n, n) to (N,), however many there are with them."""
+    good = np.ones(len(P), np.bool_)
+    for i, matrix in enumerate(P):
+        try:
+            # A few and many go different ways.
+            for count in (1, _FEW + 1):
+                whitener(np.broadcast_to(matrix, (count, *matrix.shape)))
+        except np.linalg.LinAlgError:
+            good[i] = False
+    return good
+
+
 def quadratic(d: Array, S: Array) -> tuple[Array, Array]:
     """``d' S^-1 d`` and ``0.5 log det S``, shapes (N, n), (N, n, n) to (N,), for S symmetric positive definite.
 

@@ -13,6 +13,7 @@ from common.config import Scenario
 from common.errors import EvaluationError
 from common.estimation.gaussian import Array
 from common.estimation.sprt import CONFIRMED
+from common.limits import MAX_ESTIMATE
 from common.messages import IntArray, Tracks
 from scenarios.json_lines import identity, numbers, read_lines, seconds
 
@@ -121,7 +122,7 @@ def _read_lines(file: Path, d: int) -> list[_Line]:
         if entry["status"] not in _STATUS:
             raise ValueError(f"status: {entry['status']!r} is not one of {', '.join(_STATUS)}")
         # Position and velocity, perhaps acceleration.
-        x = numbers(entry["x"], (2 * d, 3 * d), f"x, where the truth has {d} coordinates")
+        x = numbers(entry["x"], (2 * d, 3 * d), f"x, where the truth has {d} coordinates", MAX_ESTIMATE)
         return _Line(time_s, track, x[:d] if entry["status"] == "confirmed" else None)
 
     return list(read_lines(file, "track", ("time", "track", "status", "x"), parse, EvaluationError, optional=None))

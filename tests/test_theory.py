@@ -52,11 +52,11 @@ Course: TypeAlias = dict[float, Entry]
 # ---- the reference
 
 
-def sight(density: Density, sensor: Config) -> float:
-    """p_d times the probability that the position is inside the field of view."""
+def in_view(density: Density, sensor: Config) -> float:
+    """The probability that the position is inside the field of view."""
     view = sensor["field_of_view"]
     if view["shape"] == "everywhere":
-        return float(sensor["p_d"])
+        return 1.0
     (x, y), P = density.x[:2], density.P[:2, :2]
     (low_x, high_x), (low_y, high_y) = (
         (c - 0.5 * s, c + 0.5 * s) for c, s in zip(view["center"], view["size"], strict=True)
@@ -71,7 +71,7 @@ def sight(density: Density, sensor: Config) -> float:
 
     sigma = float(np.sqrt(P[0, 0]))
     low, high = max(low_x, x - 10 * sigma), min(high_x, x + 10 * sigma)
-    return float(sensor["p_d"]) * (quad(strip, low, high, epsabs=1e-13, epsrel=1e-12)[0] if low < high else 0.0)
+    return float(quad(strip, low, high, epsabs=1e-13, epsrel=1e-12)[0]) if low < high else 0.0
 
 
 def area(sensor: Config) -> float:
@@ -79,15 +79,20 @@ def area(sensor: Config) -> float:
     return float(view["area"] if view["shape"] == "everywhere" else np.prod(view["size"]))
 
 
-def weighed(density: Density, plots: Array, sensor: Config, p_d: float, p_g: float) -> tuple[list[float], list[bool]]:
-    """Eq. (6): log p*_j, and which plots are in the gate."""
+def weighed(
+    density: Density, judge: Density, plots: Array, sensor: Config, p_g: float
+) -> tuple[list[float], list[bool]]:
+    """Eq. (6), (6a): log p*_j, and which plots are in the gate; the judge says whether the target is in view."""
+    p_d, surely = float(sensor["p_d"]), [1.0] + [0.0] * len(plots)
+    missed = 1.0 - p_d * p_g * in_view(judge, sensor)
     H, R = np.eye(len(sensor["sigma"]), len(density.x)), np.diag(np.square(sensor["sigma"]))
     S = H @ density.P @ H.T + R
     rho_f = sensor["false_plots"] / area(sensor)
-    log_p_star, inside = [float(np.log(1 - p_d * p_g)) if p_d * p_g < 1 else -np.inf], []
-    for z in plots:
+    log_p_star, inside = [float(np.log(missed)) if missed > 0 else -np.inf], []
+    for j, z in enumerate(plots):
         nu = z - H @ density.x
-        log_p_star.append(float(np.log(p_d / rho_f)) + log_normal(nu, S) if p_d > 0 else -np.inf)
+        p_j = p_d * in_view(updated(judge, plots, sensor, np.roll(surely, j + 1)), sensor)
+        log_p_star.append(float(np.log(p_j / rho_f)) + log_normal(nu, S) if p_j > 0 else -np.inf)
         inside.append(bool(nu @ np.linalg.solve(S, nu) <= chi2.ppf(p_g, len(z))))
     return log_p_star, inside
 
@@ -111,11 +116,10 @@ def filtered(
     """One scan: Eq. (6), (7), or (12), (13) with the honest density deciding, also on p_d and gate."""
     tight, p_g = fusion["association"] == "tight", fusion["gate_probability"]
     judge = honest if tight else factor
-    p_d = sight(judge, sensor)
-    log_q, inside = weighed(judge, plots, sensor, p_d, p_g)
+    log_q, inside = weighed(judge, judge, plots, sensor, p_g)
     log_q = [w if j == 0 or inside[j - 1] else -np.inf for j, w in enumerate(log_q)]
     q = np.exp(np.array(log_q) - logsumexp(log_q))
-    log_p_star, _ = weighed(factor, plots, sensor, p_d, p_g)
+    log_p_star, _ = weighed(factor, judge, plots, sensor, p_g)
     if not tight:
         return updated(factor, plots, sensor, q), honest, float(logsumexp(log_q))
     log_p_bar = sum(float(q_j * (w - np.log(q_j))) for q_j, w in zip(q, log_p_star, strict=True) if q_j > 0)

@@ -139,6 +139,13 @@ FAULTS: list[tuple[dict[str, Any], str]] = [
         "sensor.0.update: 'sigma-point' is for plots that are not linear in the state; a position is",
     ),
     ({"max_speed": 10.0}, "sensor.0.max_speed: only a polar-doppler sensor has it, this one is polar"),
+    ({"velocity": [1.0]}, "sensor.0.velocity: has 1 numbers, this scenario's dimensions need 2"),
+    ({"heading": 90.0}, "sensor.0.heading: 90 is no angle in radians (-2 pi to 2 pi)"),
+    ({"azimuth": "bow"}, "sensor.0.azimuth: 'bow' is not one of 'north' or 'heading'"),
+    (
+        {"kind": "position", "sigma": [5.0, 5.0], "azimuth": "heading"},
+        "sensor.0.azimuth: a position has none; it is in the frame of the scenario",
+    ),
     ({"field_of_view": EVERYWHERE}, "sensor.0.field_of_view.area: is missing"),
     (
         {"kind": "bearing", "sigma": [0.1], "field_of_view": {**EVERYWHERE, "area": 1.0}},

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import all_same, live_as_replayed, scenario, sensor_table
+from builders import all_same, live_as_replayed, same, scenario, sensor_table
 
 from common.config import Scenario
 from common.errors import PlotsError, PlotsWarning
 from common.estimation.gaussian import Array
-from common.messages import NEVER, Decision, Scan, Tracks
+from common.messages import NEVER, Decision, Scan, Start, Tracks
 from scenarios.plots import read_plots, write_plots
 from scenarios.world import simulate_all
 from sensor_node.tracker import LocalTracker
@@ -401,3 +401,18 @@ def test_the_center_is_told_how_a_sensor_moves_where_it_needs_it(mode: str) -> N
 
 def _simulated(plot: Scenario) -> tuple[Scenario, list[Scan]]:
     return plot, [scan for scan in simulate_all(plot, 3) if scan.sensor == "s0"]
+
+
+@pytest.mark.parametrize("wrong", ["position", "velocity", "heading"])
+def test_what_was_prepared_for_another_pose_is_not_used(wrong: str) -> None:
+    plot = network()
+    moved, (scan, *_) = carried(*_simulated(plot), VELOCITY, HEADING)
+    tracker, scan = LocalTracker.of(moved, scan.sensor), scan._replace(time_ns=plot.to_ns(1.0))
+    x, P = (np.stack(parts) for parts in zip(*(each.density for each in moved.hypotheses), strict=True))
+    ids, zero = np.arange(2), np.zeros(2)
+    start = Start("s0", 1, ids, np.full(2, plot.to_ns(0.0)), zero, x, P, x, P)
+    state = tracker.start(tracker.initial(), start)
+    pose = scan.pose._replace(**{wrong: 1.5 * getattr(scan.pose, wrong)})
+    _, report = tracker.scan(tracker.prepare(state, scan.time_ns, pose), scan, NEVER)
+    assert same(report, tracker.scan(state, scan, NEVER)[1])
+    assert not same(report, tracker.scan(state, scan._replace(**{wrong: getattr(pose, wrong)}), NEVER)[1])

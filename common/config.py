@@ -39,6 +39,8 @@ from common.sensor_config import SectorConfig as SectorConfig
 from common.sensor_config import SensorConfig as SensorConfig
 from common.sensor_config import sensor_faults, wrong_length
 
+#: What nodes and center must have in common.
+_COMMON = {"epoch", "motion", "initiation", "fusion", "sensors"}
 #: Tables that come in kinds, and the key that tells which.
 _TAGGED = {"field_of_view": "shape", "detection": "model"}
 
@@ -214,8 +216,12 @@ class Scenario(Model):
     @property
     def digest(self) -> str:
         """Of what node and center must have in common, or LR would be wrong without a word: models, fusion, sensors."""
-        common = self.model_dump_json(include={"epoch", "motion", "initiation", "fusion", "sensors"})
-        return hashlib.sha256(common.encode()).hexdigest()[:16]
+        return _digest(self.model_dump_json(include=_COMMON))
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """The same of each part by itself, to tell in which part two scenarios differ."""
+        return {part: _digest(self.model_dump_json(include={part})) for part in sorted(_COMMON)}
 
     @property
     def joint(self) -> bool:
@@ -226,6 +232,10 @@ class Scenario(Model):
     def share(self) -> Share:
         """A sensor's share of prior and process noise."""
         return Share(1.0 if self.fusion.mode in ("naive", "selected") else float(len(self.sensors)))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def load_scenario(path: Path) -> Scenario:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeAlias
 
+from common.clock import now_ns
 from common.health import Answer
 
 
@@ -102,9 +102,9 @@ class Inbox:
         return self._queue.empty()
 
     def receive(self, until_ns: int | None) -> Incoming:
-        """The next thing that happens, at the latest at wall time ``until_ns``; None: however long it takes."""
+        """The next thing that happens, at the latest at ``until_ns`` of ``now_ns``; None: however long it takes."""
         try:
-            timeout = None if until_ns is None else max(0.0, (until_ns - time.time_ns()) / 1e9)
+            timeout = None if until_ns is None else max(0.0, (until_ns - now_ns()) / 1e9)
             return self._queue.get(timeout=timeout)
         except Empty:
             return Elapsed()

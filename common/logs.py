@@ -38,7 +38,7 @@ class Complaints:
         self._logged_at: dict[tuple[str, ...], float] = {}
         self.counts: Counter[str] = Counter()
 
-    def add(self, kind: str, why: str, count: int = 1, **about: str) -> None:
+    def add(self, kind: str, why: str, count: int = 1, **about: str) -> bool:
         """Count ``count`` events of a kind, and say why unless that was said within the last second.
 
         Args:
@@ -46,9 +46,14 @@ class Complaints:
             why: it happened.
             count: of events.
             about: further fields of the line, such as the sensor; a kind is said once a second for each of them.
+
+        Returns:
+            whether it was said.
         """
         self.counts[kind] += count
         now, said = time.monotonic(), (kind, *about.values())
         if now - self._logged_at.get(said, -1.0) >= 1.0:
             self._logged_at[said] = now
             self._log.warning(kind, why=why, count=self.counts[kind], **about)
+            return True
+        return False

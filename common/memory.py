@@ -119,6 +119,10 @@ class _MemoryBus(Bus):
     def endpoints(self) -> tuple[str, ...]:
         return ()
 
+    @property
+    def peer_of_router(self) -> bool:
+        return False
+
     def close(self) -> None:
         with self.network.lock:
             self.closed = True

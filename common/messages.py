@@ -258,6 +258,14 @@ class Clock(NamedTuple):
     speed: float
     clear_ns: int
 
+    def due_ns(self, time_ns: int) -> int:
+        """Instant of the wall clock at which a measurement time is there; not in lockstep."""
+        return self.wall_ns + round((time_ns - self.time_ns) / self.speed)
+
+    def present_ns(self, wall_ns: int) -> int:
+        """Measurement time at an instant of the wall clock; not in lockstep."""
+        return self.time_ns + round((wall_ns - self.wall_ns) * self.speed)
+
 
 class Tracks(NamedTuple):
     """The fused picture after all reports of one measurement time.
@@ -359,6 +367,10 @@ class Keys(NamedTuple):
     def tracks(self) -> str:
         """Center to all."""
         return f"waldnet/{self.network}/center/tracks"
+
+    def notice(self) -> str:
+        """Center to all: what somebody should look after, as JSON (``common.notice``)."""
+        return f"waldnet/{self.network}/center/notice"
 
     def decision(self) -> str:
         """Center to all."""

@@ -34,6 +34,11 @@ DeliverMiss = Callable[[str, int], None]  # key, number of samples
 
 KeyExpr = zenoh.KeyExpr
 
+#: What to tell of a process for which ``Bus.peer_of_router`` holds.
+PEER_OF_ROUTER = (
+    "is a peer of a router, and routers carry nothing from peer to peer: start everybody with --mode client"
+)
+
 CONNECT_TIMEOUT_S = 5.0  # so long a client waits for a router or center that starts at the same time
 
 _RETRY_MS = 100
@@ -123,6 +128,10 @@ class Bus(Protocol):
     def endpoints(self) -> tuple[str, ...]:
         """Return where this bus listens, with the actual port where port 0 was asked for."""
 
+    @property
+    def peer_of_router(self) -> bool:
+        """Whether this process is a peer that is linked to a router and to no other peer: see ``PEER_OF_ROUTER``."""
+
     def close(self) -> None:
         """Withdraw everything and leave; what has arrived is still delivered. Closing again does nothing."""
 
@@ -150,7 +159,7 @@ def open_zenoh(network: Network) -> Bus:
     _check_endpoints(network)
     zenoh.try_init_log_from_env()  # type: ignore[no-untyped-call]  # silent unless RUST_LOG is set
     session = _open_session(network)
-    return _ZenohBus(session, _listening(session, network), Allowance(network.link_bit_s))
+    return _ZenohBus(session, network.mode, _listening(session, network), Allowance(network.link_bit_s))
 
 
 def _port(endpoint: str) -> int:
@@ -288,7 +297,8 @@ def _matching(publisher: zenoh.Publisher) -> bool:
 
 
 class _ZenohBus(Bus):
-    def __init__(self, session: zenoh.Session, endpoints: tuple[str, ...], allowance: Allowance) -> None:
+    def __init__(self, session: zenoh.Session, mode: str, endpoints: tuple[str, ...], allowance: Allowance) -> None:
+        self._mode = mode
         self._session, self._endpoints, self._allowance = session, endpoints, allowance
         # Zenoh withdraws what nobody refers to. Its close() ends publishers, even amid a put() where undeclare() fails,
         # but not advanced subscribers: the stack undeclares all else.
@@ -387,6 +397,13 @@ class _ZenohBus(Bus):
 
     def endpoints(self) -> tuple[str, ...]:
         return self._endpoints
+
+    @property
+    def peer_of_router(self) -> bool:
+        if self._mode != "peer":
+            return False
+        info = self._session.info
+        return bool(info.routers_zid()) and not info.peers_zid()
 
     def close(self) -> None:
         self._closing.close()

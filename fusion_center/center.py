@@ -164,6 +164,22 @@ class Center:
             return None
         return state.waiting[min(state.waiting)].since_ns + self._hold_back_ns
 
+    def awaited(self, state: State) -> dict[str, int]:
+        """Sensors that are there and owe a report, and the wall time since which they do.
+
+        In lockstep these are the sensors that nobody can go on without, at wall time 0: as soon as they can.
+        """
+        clock = state.clock
+        if clock is None or state.finished:
+            return {}
+        members = zip(self.names, state.members, strict=True)
+        due = {name: member.next_ns for name, member in members if member.joined and member.alive}
+        due = {name: next_ns for name, next_ns in due.items() if next_ns != NEVER}
+        if clock.speed > 0.0:
+            return {name: clock.due_ns(next_ns) for name, next_ns in due.items()}
+        first_ns = min([*state.waiting, *due.values()], default=NEVER)
+        return {name: 0 for name, next_ns in due.items() if next_ns <= first_ns}
+
     @property
     def _hold_back_ns(self) -> int:
         return round(self.fusion.hold_back * NS_PER_S)
@@ -263,8 +279,7 @@ class Center:
         """Whether a time lies farther in the future than the window: one wrong clock must not make all others late."""
         if clock is None or clock.speed == 0.0:
             return False
-        present_ns = clock.time_ns + round((now_ns - clock.wall_ns) * clock.speed)
-        return time_ns > present_ns + self._window_ns + NS_PER_S
+        return time_ns > clock.present_ns(now_ns) + self._window_ns + NS_PER_S
 
     def _accept(self, state: State, heard: AnyHeard, now_ns: int) -> tuple[State, list[Message]]:
         report = heard.report
@@ -272,7 +287,11 @@ class Center:
         heard = heard._replace(lineage=self._lineage(state, number, report))
         if report.time_ns <= state.time_ns:
             return self._late(state, number, heard)
-        waiting = state.waiting.get(report.time_ns, Waiting({}, now_ns))
+        since_ns = now_ns
+        if state.clock is not None and state.clock.speed > 0.0:
+            # A sensor whose clock is ahead must not make all others late.
+            since_ns = max(now_ns, state.clock.due_ns(report.time_ns))
+        waiting = state.waiting.get(report.time_ns, Waiting({}, since_ns))
         if number in waiting.reports:
             return state.counted("repeated"), []
         waiting = waiting._replace(reports={**waiting.reports, number: heard})

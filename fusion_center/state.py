@@ -133,7 +133,7 @@ class Waiting(NamedTuple):
 
     Attributes:
         reports: by number of the sensor.
-        since_ns: wall time of the first one's arrival.
+        since_ns: wall time at which the first one came, or, if that is later, at which it was due.
     """
 
     reports: Mapping[int, AnyHeard]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
 
+from common import notice
+from common.clock import now_ns
 from common.codec import decode
 from common.config import Network, Scenario
 from common.errors import DecodeError
@@ -96,7 +97,7 @@ class Run:
         )
 
     def _watch(self, bus: Bus) -> None:
-        for key in (self._keys.tracks(), self._keys.decision(), self._keys.clock()):
+        for key in (self._keys.tracks(), self._keys.decision(), self._keys.clock(), self._keys.notice()):
             bus.subscribe(key, self._inbox.heard, history=200)
         bus.subscribe(self._keys.plots(), self._inbox.heard, reliable=False, on_miss=self._inbox.missed)
         bus.watch(self._keys.sensor_alive(), self._inbox.present)
@@ -126,8 +127,8 @@ class Run:
         until_ns: int | None = None
         while not self._stopped:
             if until_ns is None and not self._running:
-                until_ns = time.time_ns() + _LAST_WORDS_NS
-            if until_ns is not None and (self._finished or time.time_ns() >= until_ns):
+                until_ns = now_ns() + _LAST_WORDS_NS
+            if until_ns is not None and (self._finished or now_ns() >= until_ns):
                 return
             self._work_off(self._inbox.receive(until_ns))
 
@@ -158,6 +159,9 @@ class Run:
 
     def _hear(self, key: str, payload: bytes) -> None:
         try:
+            if key == self._keys.notice():
+                self._status.say(notice.decode(key, payload).text, "yellow")
+                return
             message = decode(key, payload)
         except DecodeError as error:
             self._status.say(str(error), "yellow")

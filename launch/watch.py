@@ -10,6 +10,8 @@ from typing import Any
 
 import structlog
 
+from common import notice
+from common.clock import now_ns
 from common.codec import decode
 from common.config import Network, Scenario
 from common.errors import DecodeError
@@ -19,7 +21,7 @@ from common.inbox import Asked, Heard, Inbox, Incoming, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Clock, Decision, Keys, Tracks, sensor_of
 from common.process import stopped_by_signals
-from common.transport import Bus, open_zenoh
+from common.transport import PEER_OF_ROUTER, Bus, open_zenoh
 from studies.lines import decision_entry, decision_text, finite
 
 CENTER = "center"
@@ -51,16 +53,16 @@ class Watch:
 
     def run(self, *, until_end: bool) -> None:
         """Listen, and say what happens."""
-        for key, history in ((self._keys.decision(), 200), (self._keys.clock(), 1)):
+        for key, history in ((self._keys.decision(), 200), (self._keys.clock(), 1), (self._keys.notice(), 1)):
             self._bus.subscribe(key, self._inbox.heard, history=history)
         for key in (self._keys.sensor_alive(), self._keys.center_alive()):
             self._bus.watch(key, self._inbox.present)
-        quiet_ns: int | None = time.time_ns() + _QUIET_NS
+        quiet_ns: int | None = now_ns() + _QUIET_NS
         while not (self._stopped or (until_end and self._ended)):
             self._handle(self._inbox.receive(quiet_ns))
             if CENTER in self._there:
                 quiet_ns = None
-            elif quiet_ns is not None and time.time_ns() >= quiet_ns:
+            elif quiet_ns is not None and now_ns() >= quiet_ns:
                 quiet_ns = None
                 self._nobody()
         # Keys are read side by side: the end may overtake the last decision.
@@ -84,6 +86,10 @@ class Watch:
 
     def _hear(self, key: str, payload: bytes) -> None:
         try:
+            if key == self._keys.notice():
+                told = notice.decode(key, payload)
+                self._say(told.text, "notice", about=told.kind, sensor=told.sensor, why=told.text)
+                return
             message = decode(key, payload)
         except DecodeError as error:
             self._complaints.add("bad bytes", str(error))
@@ -132,9 +138,10 @@ class Watch:
 
     def _nobody(self) -> None:
         where = ", ".join((*self._network.connect, *self._network.listen)) or "no endpoint"
+        routed = self._bus.peer_of_router
         why = (
             f"no center of network {self._network.name!r} is there ({self._network.mode} at {where}); waiting for one. "
-            "Is it running, and is the network's name the same?"
+            + (f"This watcher {PEER_OF_ROUTER}" if routed else "Is it running, and is the network's name the same?")
         )
         self._say(why, "waiting", why=why)
 

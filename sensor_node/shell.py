@@ -9,6 +9,8 @@ from collections.abc import Sequence
 
 import structlog
 
+from common import notice
+from common.clock import now_ns, set_by_ns
 from common.codec import decode, encode
 from common.config import Network
 from common.errors import ConfigError, DecodeError, TransportError, VersionError
@@ -16,7 +18,8 @@ from common.health import Health, age_s
 from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Advice, Begin, Clock, Keys, Message, Rebase, Scan, Start, Stop
-from common.transport import Bus, Publisher
+from common.notice import Notice
+from common.transport import PEER_OF_ROUTER, Bus, Publisher
 from sensor_node.tracker import LocalTracker
 
 #: Between two requests to join while no center answers.
@@ -24,6 +27,8 @@ _JOIN_EVERY_NS = 1_000_000_000
 #: So long before a scan the work ahead of it is done: not while a center on the same machine is busy, and late enough
 #: that its results are still in the caches.
 _AHEAD_NS = 10_000_000
+#: A clock that begins later than that from now is another host's idea of the time.
+_EARLY_S = 1.0
 #: With all scans sent, how long a center that is gone may take to come back for the last reports.
 _FAREWELL_NS = 5_000_000_000
 
@@ -80,13 +85,13 @@ class NodeShell:
         Raises:
             TransportError: no center answered within the patience.
             VersionError: the center speaks another wire version.
-            ConfigError: the center runs another scenario.
+            ConfigError: the center runs another scenario; the parts that differ are named.
         """
         self._open()
         while not self._stopped and not self._done():
             due = self._due_ns()
             if self._inbox.empty:
-                if due is not None and due <= time.time_ns():
+                if due is not None and due <= now_ns():
                     self._process(self._scans[self._position])
                     continue
                 due = self._work_ahead(due)
@@ -94,7 +99,7 @@ class NodeShell:
         self._log.info("ended", scans=self._position, of=len(self._scans), dropped=dict(self.complaints.counts))
 
     def _open(self) -> None:
-        for key in (self._keys.command(self._name), self._keys.clock(), self._keys.advice()):
+        for key in (self._keys.command(self._name), self._keys.clock(), self._keys.advice(), self._keys.notice()):
             self._bus.subscribe(key, self._inbox.heard, on_miss=self._inbox.missed)
         self._publishers = {
             self._keys.report(self._name): self._bus.publisher(self._keys.report(self._name)),
@@ -105,7 +110,7 @@ class NodeShell:
         self._bus.answer(self._keys.about(self._name), lambda: about)
         self._bus.announce(self._keys.sensor_alive(self._name))
         self._bus.watch(self._keys.center_alive(), self._inbox.present)
-        self._began_ns = time.time_ns()
+        self._began_ns = now_ns()
         self._ask_ns = self._began_ns + _JOIN_EVERY_NS
 
     def _wake_ns(self, due_ns: int | None) -> int | None:
@@ -148,24 +153,26 @@ class NodeShell:
     def _center_changed(self, alive: bool) -> None:
         if self._center and not alive:
             self._log.warning("the center is gone; waiting for it to come back")
-        self._center, self._gone_ns = alive, None if alive else time.time_ns()
+        self._center, self._gone_ns = alive, None if alive else now_ns()
         if alive:
             self._new_center = True
             self._join()
 
     def _ask_again(self) -> None:
         """While no center has answered: ask again, and give up in the end."""
-        now = time.time_ns()
+        now = now_ns()
         if self._answered or now < self._ask_ns:
             return
         self._ask_ns = now + _JOIN_EVERY_NS
         waited = now - self._began_ns
         if waited > self._patience_ns:
             where = ", ".join((*self._network.connect, *self._network.listen)) or "no endpoint"
+            why = "is it running, with the same scenario, and is the network's name the same?"
+            if self._bus.peer_of_router:
+                why = f"this node {PEER_OF_ROUTER}"
             raise TransportError(
                 f"no center of network {self._network.name!r} answered {self._name!r} within {waited / 1e9:.0f} s "
-                f"({self._network.mode} at {where}): is it running, with the same scenario, and is the network's "
-                "name the same?"
+                f"({self._network.mode} at {where}): {why}"
             )
         if self._center:
             self._join()
@@ -173,7 +180,7 @@ class NodeShell:
     def _join(self) -> None:
         # The first time counts: over a slow link a node asks again before it can have been answered.
         if self._clock is None and not self._joined_ns:
-            self._joined_ns = time.time_ns()
+            self._joined_ns = now_ns()
         self._publish(self._tracker.join(self._state, self._incarnation, self._next_ns()))
 
     def _next_ns(self) -> int:
@@ -181,6 +188,9 @@ class NodeShell:
 
     def _hear(self, key: str, payload: bytes) -> None:
         try:
+            if key == self._keys.notice():
+                self._heed(notice.decode(key, payload))
+                return
             message = decode(key, payload)
         except DecodeError as error:
             if isinstance(error, VersionError) and not self._answered:
@@ -201,6 +211,17 @@ class NodeShell:
             case _:
                 self.complaints.add("unexpected", f"{key}: a {type(message).__name__} from the center")
 
+    def _heed(self, told: Notice) -> None:
+        """Follow a notice of the center, if it is about this node."""
+        if told.sensor != self._name:
+            return
+        if told.kind != "another scenario":
+            self._log.warning("notice", why=told.text)
+        elif told.digest == self._tracker.digest:
+            parts = [part for part, mine in self._tracker.digests.items() if told.digests.get(part) != mine]
+            differ = f" ({', '.join(parts)} differ)" if parts else ""
+            raise ConfigError(f"{told.text}{differ}; all processes of a network need the same scenario file")
+
     def _note(self, message: Start | Begin | Stop | Advice | Rebase) -> None:
         """Up to which measurement time the center has told what the node waits for in lockstep."""
         match message:
@@ -219,7 +240,7 @@ class NodeShell:
         self._advised_ns = max(given_ns, self._advised_ns or given_ns)
 
     def _set_clock(self, clock: Clock) -> None:
-        first = self._clock is None
+        first, clock = self._clock is None, clock._replace(wall_ns=clock.wall_ns - set_by_ns())
         self._clock = clock
         if self._tracker.feedback and self._new_center:
             self._advised_ns = clock.time_ns
@@ -228,10 +249,12 @@ class NodeShell:
             return
         present_ns = clock.clear_ns
         if clock.speed > 0.0:
+            # The clock is told when it begins or later, and at most a moment before.
+            if (early_s := (clock.wall_ns - now_ns()) / 1e9) > _EARLY_S:
+                self._log.warning("clock", why=f"the clock of this host is {early_s:.1f} s behind the center's")
             # Whoever asked before the clock began sees everything; whoever comes later begins with the present.
             late = not 0 < self._joined_ns <= clock.wall_ns
-            late_ns = time.time_ns() - clock.wall_ns if late else 0
-            present_ns = clock.time_ns + round(late_ns * clock.speed)
+            present_ns = clock.present_ns(now_ns() if late else clock.wall_ns)
         while self._position < len(self._scans) and self._scans[self._position].time_ns < present_ns:
             self._position += 1
         if self._position:
@@ -245,7 +268,7 @@ class NodeShell:
             return None
         time_ns = self._scans[self._position].time_ns
         if self._clock.speed > 0.0:
-            return self._clock.wall_ns + round((time_ns - self._clock.time_ns) / self._clock.speed)
+            return self._clock.due_ns(time_ns)
         advised = self._advised_ns is None or self._advised_ns >= self._clock.time_ns
         return 0 if advised and time_ns <= self._clock.clear_ns else None
 
@@ -255,7 +278,7 @@ class NodeShell:
             return due_ns
         if due_ns is None and self._tracker.feedback:  # what is to come would undo it
             return None
-        if due_ns is not None and due_ns - time.time_ns() > _AHEAD_NS:
+        if due_ns is not None and due_ns - now_ns() > _AHEAD_NS:
             return due_ns - _AHEAD_NS
         scan = self._scans[self._position]
         self._state = self._tracker.prepare(self._state, scan.time_ns, scan.pose)
@@ -276,7 +299,7 @@ class NodeShell:
         """All scans are sent, and the center has them all or is no more."""
         if not self._exhausted or self._clock is None:
             return False
-        farewell = self._gone_ns is not None and time.time_ns() >= self._gone_ns + _FAREWELL_NS
+        farewell = self._gone_ns is not None and now_ns() >= self._gone_ns + _FAREWELL_NS
         return self._clock.clear_ns == NEVER or farewell
 
     @property

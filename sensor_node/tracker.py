@@ -7,6 +7,7 @@ the same code.
 from __future__ import annotations
 
 from bisect import bisect_right
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,6 +44,7 @@ class LocalTracker:
         rounded: reports are in single precision.
         selection: which plots are sent, where the center tracks; else None.
         digest: of what the center must have in common with this node.
+        digests: of its parts, by name.
         buffer_ns: how long scans are kept.
         schedule: scan times of the network, only for ``dkf``.
     """
@@ -57,6 +59,7 @@ class LocalTracker:
     rounded: bool
     selection: Selection | None
     digest: str
+    digests: Mapping[str, str]
     buffer_ns: int
     schedule: Schedule | None
 
@@ -82,6 +85,7 @@ class LocalTracker:
             rounded=scenario.fusion.precision == "float32",
             selection=scenario.fusion.selection.build() if scenario.fusion.mode == "selected" else None,
             digest=scenario.digest,
+            digests=scenario.digests,
             buffer_ns=round(scenario.fusion.window * NS_PER_S),
             schedule=schedule if scenario.fusion.mode == "dkf" else None,
         )

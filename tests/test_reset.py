@@ -277,10 +277,11 @@ def with_late_reports(order: Sequence[int], delay: float) -> Network:
     network, late = Network(resetting(*(sensor_table(name) for name in "abc"), fusion=fusion), speed=1.0), []
     for at in range(0, 9, 3):
         prompt, *others = [network.report(scan) for scan in network.scans[at : at + 3]]
-        network.tell(prompt)
+        # At once, but after its scan: the hold-back does not begin before that.
+        network.tell(prompt, 1.0 + seconds(network, network.scans[at]))
         late += others
     for number in order:
-        network.tell(late[number], 1.0)
+        network.tell(late[number], 100.0)
     return network
 
 

@@ -504,7 +504,9 @@ def _evidence(scenario: Scenario, one: _Recorded, read: Callable[[Array, Array],
         ranks[rows] += 1
         at = hypotheses_at(scenario, np.full(len(starts), time_s))
         density = Gaussian(at.x[rows], at.P[rows])
-        p_d = sensor.detection_probability(density, scan.position, one.config.view_center(scan.position))
+        view = sensor.view(one.config.view_center(scan.position))
+        p_d = sensor.detection_probability(density, scan.position)
+        p_d = p_d if view is None else p_d * view.probability_inside(density)
         z = read(scan.z, np.broadcast_to(scan.position, (len(scan.z), one.dimensions)))
         total[rows] += np.log(np.maximum(1.0 - p_d + p_d * _ratio(sensor, density, z, scan.position), 1e-9))
     return float(np.maximum(total, 0.0).sum())

@@ -143,7 +143,7 @@ class PeerTracker:
     def _sees(self, eye: Eye, scan: Scan, track: Any, time: datetime) -> bool:
         """Whether a track is in the field of view of a sensor."""
         place = place_of(self._predictor.predict(track, timestamp=time))
-        return bool(eye.model.field_of_view.contains(place, eye.config.view_center(scan.position)))
+        return bool(eye.model.at(scan.pose).field_of_view.contains(place, eye.config.view_center(scan.position)))
 
     def lines(self, t_ns: int) -> Iterator[dict[str, Any]]:
         """All tracks at a time, and those held that were worked on then."""

@@ -173,16 +173,22 @@ def _draw_sensor(axes: Axes, record: Record, sensor: SensorConfig) -> None:
     center = sensor.view_center(stands[-1])[:2]
     style: dict[str, Any] = {"fill": False, "ec": _SENSOR, "alpha": 0.35, "ls": ":"}
     view = sensor.field_of_view
+    # Matplotlib counts degrees counter-clockwise from east.
+    turned = -np.degrees(_last_heading(record, sensor))
     if isinstance(view, BoxConfig):
-        size = np.array(view.size[:2])
-        axes.add_patch(Rectangle(tuple(center - size / 2), *size, **style))
+        size, angle = np.array(view.size[:2]), turned if view.center is None else 0.0
+        axes.add_patch(Rectangle(tuple(center - size / 2), *size, angle=angle, rotation_point="center", **style))
     elif isinstance(view, DiscConfig):
         axes.add_patch(Circle(tuple(center), view.radius, **style))
     elif isinstance(view, SectorConfig):
-        # Matplotlib counts degrees counter-clockwise from east.
-        middle, half = 90.0 - np.degrees(view.direction), 0.5 * np.degrees(view.width)
+        middle, half = 90.0 + turned - np.degrees(view.direction), 0.5 * np.degrees(view.width)
         ring = view.radius - view.inner if view.inner else None
         axes.add_patch(Wedge(tuple(center), view.radius, middle - half, middle + half, width=ring, **style))
+
+
+def _last_heading(record: Record, sensor: SensorConfig) -> float:
+    """Which way the platform of a sensor points at the end [rad]."""
+    return next((scan.heading for scan in reversed(record.scans) if scan.sensor == sensor.name), sensor.heading or 0.0)
 
 
 def _namesakes(record: Record, sensor: SensorConfig, stand: Array) -> int:

@@ -102,26 +102,22 @@ def cost(world: World, kind: str) -> Cost:
         ]
         sizes = np.array([sender.hear() for sender in senders])
         hub.hear()
-        interval_ns = round(1e9 * world.interval_s)
-        start_ns = time.monotonic_ns() + interval_ns
-        for sender in senders:
-            sender.tell(str(start_ns))
-        # Counted in the middle of an interval: what belongs to a scan has passed by then.
-        begin = _count(net, start_ns + round((_WARM_UP - 0.5) * interval_ns))
-        end = _count(net, start_ns + round((world.scans - 0.5) * interval_ns))
-        hub.tell("counts")
-        counts = hub.hear()
-        if counts != {"came": sizes.size, "lost": 0}:
-            raise BenchError(f"{kind}: {sizes.size} messages were sent, {counts['came']} came, {counts['lost']} lost")
+        # Counted half an interval after the last message of a scan came, before the next one is sent: what belongs to
+        # a scan has passed by then, however slow the machine is.
+        counted = []
+        for scan in range(world.scans):
+            for sender in senders:
+                sender.tell("send")
+            hub.tell(str(expected := (scan + 1) * world.sensors))
+            counts = hub.hear()
+            if counts != {"came": expected, "lost": 0}:
+                raise BenchError(f"{kind}: {expected} messages were sent, {counts['came']} came, {counts['lost']} lost")
+            time.sleep(0.5 * world.interval_s)
+            counters = net.bytes("hub")
+            counted.append(counters.sent + counters.received)
+            time.sleep(0.5 * world.interval_s)
     measured = sizes[:, _WARM_UP:]
-    return Cost(float(measured.mean()), (end - begin) / measured.size)
-
-
-def _count(net: Namespaces, at_ns: int) -> int:
-    """Bytes in both directions, counted at an instant of the monotonic clock."""
-    time.sleep(max(0, at_ns - time.monotonic_ns()) / 1e9)
-    counters = net.bytes("hub")
-    return counters.sent + counters.received
+    return Cost(float(measured.mean()), (counted[-1] - counted[_WARM_UP - 1]) / measured.size)
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:

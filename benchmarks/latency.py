@@ -156,15 +156,8 @@ class Ours:
             {time_ns: (began, out) for time_ns, began, out in node.hear()["node"]} for node in self._nodes
         ]
         stamps = self._center.hear()
-        came, published = dict(stamps["came"]), dict(stamps["center"])
-        parts: dict[str, list[float]] = {"total": [], "node": [], "wire": [], "center": []}
-        for time_ns, arrived in sorted(self._watch.arrivals.items())[_WARM_UP:]:
-            began, out = max(node[time_ns] for node in nodes)
-            total, node, center = arrived - began, out - began, published[time_ns] - came[time_ns]
-            values = {"total": total, "node": node, "center": center, "wire": total - node - center}
-            for part, value in values.items():
-                parts[part].append(value / 1e3)
-        return parts
+        arrivals = dict(sorted(self._watch.arrivals.items())[_WARM_UP:])
+        return parts_of(arrivals, nodes, dict(stamps["came"]), dict(stamps["center"]))
 
     def _hear_clock(self, key: str, payload: bytes) -> None:
         message = decode(key, payload)
@@ -177,6 +170,30 @@ class Ours:
         message = decode(key, payload)
         assert isinstance(message, Tracks)
         self._watch.note(message.time_ns, at)
+
+
+def parts_of(
+    arrivals: Mapping[int, int],
+    nodes: Sequence[Mapping[int, tuple[int, int]]],
+    came: Mapping[int, int],
+    published: Mapping[int, int],
+) -> dict[str, list[float]]:
+    """The parts of every cycle: total, node, wire, center [us].
+
+    Args:
+        arrivals: when the picture of a measurement time was in the subscriber's hands [ns].
+        nodes: of each node, when it began to work on its scan of that time and when its report was handed over [ns].
+        came: when the last report of that time was in the center's hands [ns].
+        published: when the center handed the picture over [ns].
+    """
+    parts: dict[str, list[float]] = {"total": [], "node": [], "wire": [], "center": []}
+    for time_ns, arrived in arrivals.items():
+        began, out = max(node[time_ns] for node in nodes)
+        total, node, center = arrived - began, out - began, published[time_ns] - came[time_ns]
+        values = {"total": total, "node": node, "center": center, "wire": total - node - center}
+        for part, value in values.items():
+            parts[part].append(value / 1e3)
+    return parts
 
 
 class Raw:

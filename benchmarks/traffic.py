@@ -5,8 +5,7 @@
 
 Messages, codec, keys and the settings of the network are the product's; kinds are ``reports``, ``proposals`` (reports
 without tracks, of the plots that none claims) and ``plots``, the last as a centralised tracker needs them: none may be
-lost. A sensor is told on standard input at which nanosecond of the monotonic clock to start, and says how large its
-payloads were.
+lost. A sensor says how large its payloads are, and sends the next one at every line of its standard input.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from __future__ import annotations
 import json
 import sys
 import threading
-import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -29,6 +27,8 @@ from fusion_center.center import Center
 from sensor_node.tracker import LocalTracker
 
 PORT = 7447
+#: A message that has not come by then is lost.
+_PATIENCE_S = 60.0
 #: Plots this far from every target are no track's.
 _UNCLAIMED_M = 300.0
 _KEYS = Keys("bench")
@@ -87,7 +87,7 @@ def _next_ns(world: World, scan: Scan) -> int:
 
 
 def sensor(world: World, name: str, kind: str, address: str) -> None:
-    """Send all messages of one kind, one an interval."""
+    """Send all messages of one kind, one at every line of standard input."""
     payloads, key = [], ""
     for message in messages(world, name, kind):
         key = _KEYS.of(message)
@@ -99,24 +99,27 @@ def sensor(world: World, name: str, kind: str, address: str) -> None:
         bus.announce(_KEYS.sensor_alive(name))
         here.wait()
         print(json.dumps([len(payload) for payload in payloads]), flush=True)
-        start_ns = int(sys.stdin.readline())
-        for number, payload in enumerate(payloads):
-            time.sleep(max(0, start_ns + round(number * 1e9 * world.interval_s) - time.monotonic_ns()) / 1e9)
+        for payload, _ in zip(payloads, sys.stdin, strict=False):
             publisher.put(payload)
         sys.stdin.read()
 
 
 def hub(address: str, sensors: int) -> None:
-    """Take what the sensors send; tell how much came and was lost when standard input says a line."""
+    """Take what the sensors send; every line of standard input asks how much came and was lost of so many messages."""
     counts = {"came": 0, "lost": 0}
     there: set[str] = set()
-    complete = threading.Event()
+    complete, changed = threading.Event(), threading.Condition()
+
+    def count(what: str, number: int) -> None:
+        with changed:
+            counts[what] += number
+            changed.notify_all()
 
     def came(key: str, payload: bytes) -> None:  # noqa: ARG001
-        counts["came"] += 1
+        count("came", 1)
 
     def missed(key: str, number: int) -> None:  # noqa: ARG001
-        counts["lost"] += number
+        count("lost", number)
 
     def present(key: str, alive: bool) -> None:
         if alive:
@@ -132,7 +135,13 @@ def hub(address: str, sensors: int) -> None:
         print(json.dumps("listening"), flush=True)
         complete.wait()
         print(json.dumps("complete"), flush=True)
-        for _ in sys.stdin:
+
+        def wait_for(expected: int) -> None:
+            with changed:
+                changed.wait_for(lambda: sum(counts.values()) >= expected, _PATIENCE_S)
+
+        for line in sys.stdin:
+            wait_for(int(line))
             print(json.dumps(counts), flush=True)
 
 

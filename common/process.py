@@ -116,7 +116,12 @@ def _until_closed(stop: Callable[[], None]) -> None:
 
 
 def main(app: App, tokens: list[str] | None = None) -> Any:
-    """Run a command line; our own errors end with one clear message and exit code 1."""
+    """Run a command line; our own errors end with one clear message and exit code 1.
+
+    SIGINT ends it, even where whoever started it ignores SIGINT, as a shell does for what runs in the background.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # what a terminal cannot show is shown escaped
             stream.reconfigure(errors="backslashreplace")

@@ -27,8 +27,8 @@ from scenarios.catalogue import find
 from studies.lines import TrackLines
 from studies.record import Record
 
-#: Nothing takes so long; whoever waits longer waits in vain.
-PATIENCE_S = 60.0
+#: Nothing takes so long, even on a busy machine; whoever waits longer waits in vain. Less than a test may take.
+PATIENCE_S = 120.0
 WALDNET = str(Path(sys.executable).with_name("waldnet"))
 ANY_PORT = "tcp/127.0.0.1:0"
 _MARK = "WALDNET_TEST_FAMILY"

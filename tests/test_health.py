@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from process_helpers import ANY_PORT, Processes, start_center, variant
+from process_helpers import ANY_PORT, PATIENCE_S, Processes, start_center, variant
 
 from common import health
 from common.errors import TransportError
@@ -124,7 +124,9 @@ def test_all_processes_answer(tmp_path: Path) -> None:
     with Processes(tmp_path) as processes:
         router = processes.waldnet("router", "--listen", ANY_PORT, "--health", sockets["router"])
         client = ("--mode", "client", "--connect", *json.loads(router.await_line("listening"))["listening"])
-        center = start_center(processes, path, *client, "--health", sockets["center"], "--speed", "4")
+        center = start_center(
+            processes, path, *client, "--health", sockets["center"], "--speed", "4", "--wait", PATIENCE_S
+        )
         watch = processes.waldnet("watch", path, *client, "--health", sockets["watch"])
         watch.await_line("the center is there")
         linked = {name: health.ask(str(sockets[name]))["linked"] for name in ("router", "center", "watch")}

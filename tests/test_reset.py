@@ -567,7 +567,6 @@ ELABORATE = {
 }
 
 
-@pytest.mark.timeout(60)
 @pytest.mark.parametrize("fusion", ELABORATE.values(), ids=ELABORATE.keys())
 def test_in_lockstep_a_network_with_feedback_is_its_replay(fusion: dict[str, Any]) -> None:
     sensors = [sensor_table("a"), sensor_table("b", scan_interval=3.0), sensor_table("c", p_d=0.6, false_plots=500.0)]

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import study_fakes
 from builders import scenario, sensor_table
-from process_helpers import Process, Processes
+from process_helpers import WALDNET, Process, Processes
 
 from common.errors import ConfigError, StudyError, TransportError, WaldnetError
 from studies import workers
@@ -357,6 +357,20 @@ def test_stopped_it_says_how_to_go_on_and_leaves_nobody_behind(
     processes.await_end(family)
     assert not list(parts.glob("*.tmp"))
     assert len(list(parts.glob("*.npz"))) < 2000
+
+
+@pytest.mark.processes
+def test_it_can_be_stopped_where_whoever_started_it_ignores_the_signal(processes: Processes, tmp_path: Path) -> None:
+    """A shell ignores SIGINT for what it runs in the background, and its children inherit that."""
+    path = tmp_path / "long.toml"
+    path.write_text(to_toml(scenario(simulation={"duration": 200.0})))
+    options = ("--modes", "federated", "--runs", "2000", "--block", "1", "--out", "out", "--workers", "2")
+    process = processes.start("sh", "-c", 'trap "" INT; exec "$@"', "sh", WALDNET, "study", str(path), *options)
+    await_part(processes, process, tmp_path / "out/parts/as-given/federated")
+    family = processes.alive()
+    process.signal(signal.SIGINT)
+    assert process.wait() == 130
+    processes.await_end(family)
 
 
 @pytest.mark.processes

@@ -459,7 +459,6 @@ HARSH = np.array(
 CHUNK = 1000
 
 
-@pytest.mark.timeout(600)
 def test_covariances_stay_symmetric_and_positive_definite() -> None:
     """Many steps of all harsh settings at once: 10^5 with WALDNET_EXPLORE=1."""
     sigma0, sigma, psd, p_d, dt, counts, share = HARSH.T

@@ -25,7 +25,7 @@ def tracks_on_a_field(rng: np.random.Generator, tracks: int, extent: float) -> G
 def world(tracks: int, plots: int, extent: float = 3e4) -> tuple[Gaussian, Any]:
     rng = np.random.default_rng(tracks)
     density = tracks_on_a_field(rng, tracks, extent)
-    near = density.x[:, :2] + rng.normal(0, 100, (tracks, 2))
+    near = density.x[:100, :2] + rng.normal(0, 100, (min(tracks, 100), 2))
     z = np.concatenate([rng.uniform(-extent, extent, (plots, 2)), near])
     return density, z[rng.permutation(len(z))]
 

@@ -29,6 +29,7 @@ from studies.evaluate.runs import read_run
 #: Scenarios of a family.
 FAMILIES = {
     "autoferry": tuple(f"autoferry-{number}-all" for number in (2, 3, 5, 13, 16)),
+    "joyride": ("joyride",),
     "solent": ("solent",),
 }
 
@@ -43,6 +44,17 @@ _FERRY: dict[str, tuple[Any, ...]] = {
     "clutter": (0.3, 1.0, 3.0, 10.0, 100.0),
     "p_d": (0.6, 0.8, 1.0),
 }
+#: A ship's radar alone, every 2.5 s.
+_SHIP: dict[str, tuple[Any, ...]] = {
+    "min_points": (2, 3, 4, 6, 8, 11),
+    "holding_s": (3.0, 6.0, 9.0, 12.0),
+    "deleter_s": (6.0, 9.0, 12.0, 20.0),
+    "gate": (0.95, 0.99, 0.999),
+    "holding_gate": (2.0, 3.0, 4.0),
+    "max_sigma_m": (30.0, 60.0, 120.0),
+    "clutter": (0.3, 1.0, 3.0),
+    "p_d": (0.8, 1.0),
+}
 #: Radars that see 20 km far are less sharp than a ferry's.
 _SHIPS: dict[str, tuple[Any, ...]] = {
     "min_points": (2, 3, 4, 5, 8, 12),
@@ -51,7 +63,7 @@ _SHIPS: dict[str, tuple[Any, ...]] = {
     "max_sigma_m": (60.0, 150.0),
     "gate": (0.95, 0.99),
 }
-GRID = {"autoferry": _FERRY, "solent": _SHIPS}
+GRID = {"autoferry": _FERRY, "joyride": _SHIP, "solent": _SHIPS}
 _ROUNDS = 2
 
 

@@ -141,7 +141,7 @@ def _with_next(when: BoolArray) -> BoolArray:
 
 def _handles(stands: Array) -> list[Line2D]:
     moving = len(stands) > 10
-    ferry = Line2D([], [], color=QUIET, lw=1.0, ls=":", label="the ferry with its sensors")
+    ship = Line2D([], [], color=QUIET, lw=1.0, ls=":", label="the ship with its sensors")
     fixed = Line2D([], [], color=QUIET, ls="", marker="s", ms=5, label="sensors")
     return [
         Line2D([], [], color=BLACK, lw=4.5, alpha=0.28, marker="", label="true paths, from the circle on"),
@@ -150,5 +150,5 @@ def _handles(stands: Array) -> list[Line2D]:
             for doing, colour in _COLOURS.items()
         ),
         Line2D([], [], color=_PLOT, marker=".", ls="", ms=6, label="plots of sensors that tell a position"),
-        ferry if moving else fixed,
+        ship if moving else fixed,
     ]

@@ -37,7 +37,7 @@ from studies.evaluate.paths import targets_at
 from studies.evaluate.runs import read_run
 from studies.evaluate.table import SUMMARY, said
 
-SCENARIOS = (*(f"autoferry-{number}-all" for number in (2, 3, 5, 13, 16)), "solent")
+SCENARIOS = (*(f"autoferry-{number}-all" for number in (2, 3, 5, 13, 16)), "joyride", "solent")
 OUT, IMAGES = Path("runs/real"), Path("docs/images")
 #: Simulated scenarios are looked at for so long, or a peer would take most of the time of all.
 _DURATION_S = 600.0

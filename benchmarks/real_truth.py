@@ -15,6 +15,9 @@ from scenarios.world import truth
 from sensor_node.sources import seed_of
 from studies.evaluate.evaluation import Rules
 
+#: Beyond it a track is no target's, by families of scenarios [m].
+_CUTOFFS_M = {"autoferry": 30.0, "joyride": 50.0}
+
 
 def truth_of(scenario: Scenario) -> dict[int, Whereabouts]:
     """The truth beside a scenario's recording, or that of its simulated world.
@@ -38,8 +41,8 @@ def truth_of(scenario: Scenario) -> dict[int, Whereabouts]:
 
 
 def rules_of(scenario: Scenario) -> Rules:
-    """How runs are judged: a ferry's radar and lidar are sharper than radars that see 20 km far."""
-    return Rules(cutoff_m=30.0 if scenario.recording is not None else 100.0)
+    """How runs are judged: a ferry's radar and lidar are sharper than a ship's radar, and that than coastal ones."""
+    return Rules(cutoff_m=next((found for name, found in _CUTOFFS_M.items() if scenario.name.startswith(name)), 100.0))
 
 
 def times_of(scenario: Scenario, scans: Sequence[Scan], known: dict[int, Whereabouts]) -> Array:

@@ -1,0 +1,1 @@
+"""Recorded plots of a ship's radar off Trondheim, with the truth of one fast boat."""

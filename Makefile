@@ -22,6 +22,7 @@ $(VENV)/test.stamp: requirements/test.lock $(VENV)/user.stamp
 setup: $(VENV)/user.stamp ## the program and what it needs, in .venv
 
 demo: $(VENV)/user.stamp ## four simulated radars, then a recorded ferry: processes decide over Zenoh
+	@rm -rf runs/four-radars runs/autoferry-5
 	@$(BIN)/waldnet run four-radars --speed 10 --out runs/four-radars
 	@$(BIN)/waldnet run autoferry-5 --speed 10 --out runs/autoferry-5
 	@echo

@@ -5,11 +5,15 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from typing import Literal, TypeAlias
+from contextlib import suppress
+from typing import Literal, NamedTuple, TextIO, TypeAlias, cast
 
 import structlog
 
 LogFormat: TypeAlias = Literal["auto", "console", "json"]
+
+#: Between two lines about one kind of complaint: at first, and when it goes on and on.
+_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 
 
 def configure(log_format: LogFormat = "auto") -> None:
@@ -24,36 +28,66 @@ def configure(log_format: LogFormat = "auto") -> None:
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             renderer,
         ],
-        logger_factory=structlog.PrintLoggerFactory(sys.stderr),
+        logger_factory=structlog.PrintLoggerFactory(cast(TextIO, _Unfailing(sys.stderr))),
         cache_logger_on_first_use=True,
     )
 
 
+class _Unfailing:
+    """A stream that loses what cannot be written: no process ends because the disk of its log is full."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        with suppress(OSError):
+            return self._stream.write(text)
+        return 0
+
+    def flush(self) -> None:
+        with suppress(OSError):
+            self._stream.flush()
+
+
 class Complaints:
-    """Counts what was dropped, and logs it once per kind and second."""
+    """Counts what was dropped, and logs it: at once, then ever more seldom while it goes on, at last every minute."""
 
     def __init__(self, log: structlog.typing.FilteringBoundLogger) -> None:
         """Log to ``log``."""
         self._log = log
-        self._logged_at: dict[tuple[str, ...], float] = {}
+        self._pauses: dict[tuple[str, ...], _Pause] = {}
         self.counts: Counter[str] = Counter()
 
     def add(self, kind: str, why: str, count: int = 1, **about: str) -> bool:
-        """Count ``count`` events of a kind, and say why unless that was said within the last second.
+        """Count ``count`` events of a kind, and say why unless that was said a short while ago.
 
         Args:
             kind: of event.
             why: it happened.
             count: of events.
-            about: further fields of the line, such as the sensor; a kind is said once a second for each of them.
+            about: further fields of the line, such as the sensor; a kind is said for each of them.
 
         Returns:
             whether it was said.
         """
         self.counts[kind] += count
         now, said = time.monotonic(), (kind, *about.values())
-        if now - self._logged_at.get(said, -1.0) >= 1.0:
-            self._logged_at[said] = now
+        pause = self._pauses.get(said, _Pause(now, 0.0))
+        if now >= pause.until_s:
+            self._pauses[said] = pause.next(now)
             self._log.warning(kind, why=why, count=self.counts[kind], **about)
             return True
         return False
+
+
+class _Pause(NamedTuple):
+    """A while in which nothing more is said of one matter."""
+
+    until_s: float
+    length_s: float
+
+    def next(self, now_s: float) -> _Pause:
+        """The one after it: twice as long, or as short as the first if nothing happened for as long as it took."""
+        goes_on = now_s - self.until_s < self.length_s
+        length_s = min(2.0 * self.length_s, _LONGEST_PAUSE_S) if goes_on else _PAUSE_S
+        return _Pause(now_s + length_s, length_s)

@@ -51,6 +51,9 @@ Seed: TypeAlias = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 #: Socket at which a process answers how it is; ask with python -m common.health.
 HealthSocket: TypeAlias = Annotated[Path | None, Parameter(name="--health")]
 
+#: Whether decisions on tracks that were never confirmed are told too.
+Verbose: TypeAlias = Annotated[bool, Parameter(negative=())]
+
 #: A switch for launchers, not for people.
 Hidden: TypeAlias = Annotated[bool, Parameter(show=False)]
 

@@ -9,7 +9,7 @@ from common.config import load_scenario
 from common.health import answering
 from common.inbox import Inbox
 from common.logs import LogFormat, configure
-from common.process import HealthSocket, Hidden, NetworkOptions, Speed, stopped_by_signals
+from common.process import HealthSocket, Hidden, NetworkOptions, Speed, Verbose, stopped_by_signals
 from common.transport import open_zenoh
 from fusion_center.center import Center
 from fusion_center.shell import CenterShell
@@ -24,6 +24,7 @@ def center(
     wait: float = 10.0,
     health: HealthSocket = None,
     log: LogFormat = "auto",
+    verbose: Verbose = False,
     with_parent: Hidden = False,
 ) -> None:
     """Run the fusion center: order the reports, compute the likelihood ratio, decide, publish.
@@ -37,6 +38,7 @@ def center(
         wait: seconds to wait for the others once a sensor has joined; then the clock starts with those that are there.
         health: local socket at which this process answers how it is (see: python -m common.health).
         log: how to log to standard error; auto: colour on a terminal, JSON elsewhere.
+        verbose: log decisions on tracks that were never confirmed too.
         with_parent: end when standard input closes.
     """
     configure(log)
@@ -47,4 +49,4 @@ def center(
     stoppable = stopped_by_signals(inbox.stop, with_parent=with_parent)
     with stoppable, answering(health, inbox.asked), open_zenoh(network) as bus:
         print(json.dumps({"listening": bus.endpoints()}), flush=True)  # noqa: T201 (for whoever started it)
-        CenterShell(bus, network, loaded, fusion, inbox=inbox).run()
+        CenterShell(bus, network, loaded, fusion, inbox=inbox, verbose=verbose).run()

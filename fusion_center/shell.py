@@ -10,6 +10,7 @@ from common import notice
 from common.clock import now_ns, set_by_ns
 from common.codec import decode, encode
 from common.config import Network, Scenario
+from common.decision_filter import DecisionFilter
 from common.errors import DecodeError
 from common.health import Health, age_s
 from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
@@ -35,7 +36,14 @@ class CenterShell:
     """The fusion center on a bus; ``run`` blocks, ``stop`` may be called from anywhere, a signal handler too."""
 
     def __init__(
-        self, bus: Bus, network: Network, scenario: Scenario, center: Center, *, inbox: Inbox | None = None
+        self,
+        bus: Bus,
+        network: Network,
+        scenario: Scenario,
+        center: Center,
+        *,
+        inbox: Inbox | None = None,
+        verbose: bool = False,
     ) -> None:
         """Take part in a network.
 
@@ -45,6 +53,7 @@ class CenterShell:
             scenario: for times in logs.
             center: the pure step.
             inbox: where somebody may have asked to stop already.
+            verbose: log decisions on tracks that were never confirmed too.
         """
         self._bus, self._scenario, self._center = bus, scenario, center
         self._log: structlog.typing.FilteringBoundLogger = structlog.get_logger().bind(center=scenario.name)
@@ -54,6 +63,7 @@ class CenterShell:
         self._state = center.initial()
         self._publishers: dict[str, Publisher] = {}
         self._picture: Tracks = center.tracks(self._state)
+        self._filter = DecisionFilter(scenario, verbose=verbose)
         self._stopped = False
         names = center.names
         self._reported_s: dict[str, float | None] = dict.fromkeys(names)
@@ -170,7 +180,8 @@ class CenterShell:
         match event:
             case Join():
                 self._heard_ns[event.sensor] = at_ns
-                self._log.info("sensor joined", sensor=event.sensor, next_s=self._seconds(event.next_ns))
+                if _epochs(before) != _epochs(self._state):
+                    self._log.info("sensor joined", sensor=event.sensor, next_s=self._seconds(event.next_ns))
             case Report() | Picked():
                 dropped = [(counts.too_late, counts.repeated) for counts in (before.counts, self._state.counts)]
                 if dropped[0] == dropped[1]:
@@ -283,7 +294,7 @@ class CenterShell:
                 self._picture, self._pictured_s = message, time.monotonic()
                 if not self._publishers[self._keys.tracks()].has_listeners:
                     return
-            case Decision():
+            case Decision() if self._filter.passes(message):
                 time_s = self._scenario.to_seconds(message.time_ns)
                 self._log.info(message.kind, track=message.track, time_s=time_s, log_lr=round(message.log_lr, 2))
             case Clock():
@@ -301,3 +312,8 @@ def _summary(event: Event) -> str:
             return f"{event.sensor} asks to join with a scenario of digest {event.digest}"
         case _:
             return type(event).__name__
+
+
+def _epochs(state: State) -> list[int]:
+    """A sensor that joins gets a new epoch; one that only asks again keeps its own."""
+    return [member.epoch for member in state.members]

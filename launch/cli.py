@@ -17,9 +17,10 @@ from benchmarks.cli import bench
 from common.config import Network, Scenario, load_scenario
 from common.errors import ConfigError
 from common.estimation.sprt import Status
+from common.files import replacing_text
 from common.logs import LogFormat, configure
 from common.messages import Tracks
-from common.process import HealthSocket, NetworkOptions, Seconds, Seed, Speed
+from common.process import HealthSocket, NetworkOptions, Seconds, Seed, Speed, Verbose
 from common.process import main as run_app
 from fusion_center.app import center
 from scenarios.catalogue import find, names
@@ -47,6 +48,7 @@ def run(
     seed: Seed | None = None,
     speed: Speed = 1.0,
     out: Path | None = None,
+    verbose: Verbose = False,
 ) -> None:
     """Run all processes of a network on this machine, and write a report.
 
@@ -55,12 +57,13 @@ def run(
         plots: recorded plots (JSON Lines) instead of the scenario's.
         seed: of the simulated world, instead of the scenario's.
         speed: seconds of measurement time per second; max: as fast as all go together.
-        out: folder of the report; default runs/SCENARIO-TIME.
+        out: folder of the report, which must not hold one yet; default runs/SCENARIO-TIME.
+        verbose: tell and log decisions on tracks that were never confirmed too.
     """
     from rich.console import Console
 
     from launch.checks import warn
-    from launch.run import Order, execute
+    from launch.run import Order, default_folder, execute
     from sensor_node.sources import all_scans, recording_of, seed_of
 
     path = find(scenario)
@@ -75,8 +78,9 @@ def run(
         plots=plots,
         seed=seed_of(loaded, seed),
         speed=speed,
-        out=out or Path("runs") / f"{loaded.name}-{stamp}",
+        out=out or default_folder(loaded.name, stamp),
         scans=scans,
+        verbose=verbose,
     )
     execute(order, Console(stderr=False, highlight=False))
 
@@ -149,9 +153,9 @@ def simulate(scenario: str, *, seed: Seed | None = None, out: Path | None = None
     seed = seed_of(loaded, seed)
     scans = simulate_all(loaded, seed)
     if truth is not None:
-        with truth.open("w", encoding="utf-8") as file:
+        with replacing_text(truth) as file:
             write_truth(file, *true_states(loaded, seed), loaded)
-    with out.open("w", encoding="utf-8") if out else nullcontext(sys.stdout) as file:
+    with replacing_text(out) if out else nullcontext(sys.stdout) as file:
         write_plots(file, scans, loaded)
 
 
@@ -220,10 +224,13 @@ def watch(
     options: NetworkOptions | None = None,
     until_end: Annotated[bool, Parameter(negative=())] = False,
     as_json: Annotated[bool, Parameter(name="--json", negative=())] = False,
+    verbose: Verbose = False,
     health: HealthSocket = None,
     log: LogFormat = "auto",
 ) -> None:
     """Print the decisions of a running network, and who comes and goes, until Ctrl-C.
+
+    Times are those of the measurements: the clock in UTC, and seconds since the scenario's epoch.
 
     Over a router it sees all who come and go; connected to the center itself, the center only.
 
@@ -231,7 +238,8 @@ def watch(
         scenario: scenario file, or name of one that comes along; for the network's name and the epoch of times.
         options: the network.
         until_end: end once all sources are exhausted.
-        as_json: print JSON lines.
+        as_json: print JSON lines, with all decisions.
+        verbose: print decisions on tracks that were never confirmed too.
         health: local socket at which this process answers how it is (see: python -m common.health).
         log: how to log to standard error.
     """
@@ -240,7 +248,7 @@ def watch(
     configure(log)
     loaded = load_scenario(find(scenario))
     network = (options or NetworkOptions()).over(loaded)
-    watch(loaded, network, until_end=until_end, as_json=as_json, health=health)
+    watch(loaded, network, until_end=until_end, as_json=as_json, verbose=verbose, health=health)
 
 
 @app.command

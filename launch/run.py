@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from rich.console import Console
@@ -14,14 +15,15 @@ from common.codec import decode
 from common.config import Network, Scenario
 from common.errors import DecodeError
 from common.estimation.sprt import Status
+from common.files import write_atomically
 from common.inbox import Exited, Heard, Inbox, Incoming, Missed, Present, Said, Stopped
 from common.messages import NEVER, Clock, Decision, Keys, Scan, Tracks, sensor_of
 from common.process import stopped_by_signals
 from common.transport import Bus, open_zenoh
 from launch.processes import Children, LaunchError, describe_exit
 from launch.status import LiveStatus
-from studies.inputs import Input, keep, looked_at
-from studies.record import Record, write_report
+from studies.inputs import Source
+from studies.run_folder import Report, RunFolder, describe, refuse_used
 
 CENTER = "center"
 #: Once all children have ended: time for what is still on its way to the launcher.
@@ -40,6 +42,7 @@ class Order:
         speed: seconds of measurement time per second, 0: lockstep.
         out: folder of the report.
         scans: of all sources, by time.
+        verbose: tell and log decisions on tracks that were never confirmed too.
     """
 
     scenario: Scenario
@@ -49,22 +52,23 @@ class Order:
     speed: float
     out: Path
     scans: Sequence[Scan]
-
-    @property
-    def end_ns(self) -> int:
-        """Time of the last scan."""
-        return self.scans[-1].time_ns if self.scans else self.scenario.epoch_ns
+    verbose: bool = False
 
 
 class Run:
     """One run: starts the processes, watches them and the network, and tells how it ended."""
 
-    def __init__(self, order: Order, console: Console) -> None:
-        """Set up; nothing is started yet."""
-        self._order = order
-        self._inbox = Inbox()
-        self.record = Record(order.scenario)
-        self._status = LiveStatus(self.record, order.end_ns, console)
+    def __init__(self, order: Order, folder: RunFolder, console: Console, inbox: Inbox) -> None:
+        """Set up; nothing is started yet.
+
+        Args:
+            order: what to run.
+            folder: where it is written down.
+            console: where it is shown.
+            inbox: where somebody may have asked to stop already.
+        """
+        self._order, self._folder, self._inbox = order, folder, inbox
+        self._status = LiveStatus(order.scenario, folder.end_ns, console, verbose=order.verbose)
         self._children = Children(order.out / "logs", self._inbox)
         self._keys = Keys(order.scenario.network.name)
         self._shared: list[str] = []
@@ -78,7 +82,7 @@ class Run:
             LaunchError: the center did not start or died, or all sensors died.
         """
         listen = Network(name=self._keys.network, listen=("tcp/127.0.0.1:0",))
-        with stopped_by_signals(self._inbox.stop), open_zenoh(listen) as bus:
+        with open_zenoh(listen) as bus:
             try:
                 self._watch(bus)
                 with self._status:
@@ -105,11 +109,11 @@ class Run:
     def _start_center(self, here: tuple[str, ...]) -> None:
         # Children take the network's name and nothing else of it from the scenario: all are on this machine.
         file = self._order.out / "network.toml"
-        file.write_text(f'name = "{self._keys.network}"\n')
+        write_atomically(file, f'name = "{self._keys.network}"\n'.encode())
         self._shared = ["--network", str(file), *_options("--connect", here)]
         speed = str(self._order.speed) if self._order.speed else "max"
-        listen = ["--listen", "tcp/127.0.0.1:0"]
-        self._start(CENTER, "fusion_center", [str(self._order.path), *self._shared, *listen, "--speed", speed])
+        how = ["--listen", "tcp/127.0.0.1:0", "--speed", speed, *(["--verbose"] if self._order.verbose else [])]
+        self._start(CENTER, "fusion_center", [str(self._order.path), *self._shared, *how])
 
     def _start_sensors(self, center: tuple[str, ...]) -> None:
         order = self._order
@@ -164,9 +168,12 @@ class Run:
                 return
             message = decode(key, payload)
         except DecodeError as error:
-            self._status.say(str(error), "yellow")
+            self._folder.refuse("bytes that are no message")
+            self._leave_out("bytes that are no message", str(error))
             return
-        self.record.note(message)
+        if (reason := self._folder.note(message)) is not None:
+            self._leave_out(reason, key)
+            return
         match message:
             case Tracks():
                 self._status.picture(message)
@@ -177,8 +184,13 @@ class Run:
             case _:
                 pass
 
+    def _leave_out(self, reason: str, where: str) -> None:
+        """Say why a message is left out, once for every reason."""
+        if self._folder.refused[reason] == 1:
+            self._status.say(f"left out: {reason} ({where})", "yellow")
+
     def _plots_shed(self, sensor: str, number: int) -> None:
-        shed = self.record.plots_shed
+        shed = self._folder.plots_shed
         if sensor not in shed:
             self._status.say(f"{sensor}: not all plots are shown, its link is full: reports go first", "yellow")
         shed[sensor] = shed.get(sensor, 0) + number
@@ -190,9 +202,10 @@ class Run:
                 raise LaunchError(f"the fusion center died ({how}): {self._children.last_words(CENTER)}")
         elif code != 0:
             why = f"{how}: {self._children.last_words(name)}" if code > 0 else how
-            self.record.lost[name] = why
+            self._folder.lost[name] = why
+            self._status.lose(name)
             self._status.say(f"sensor {name} died ({why}); the run goes on with the others", "bold red")
-            if set(self.record.lost) == set(self._order.scenario.sensor_names):
+            if set(self._folder.lost) == set(self._order.scenario.sensor_names):
                 raise LaunchError("all sensors died; the logs in the report folder say why")
 
 
@@ -200,23 +213,48 @@ def _options(option: str, values: tuple[str, ...]) -> list[str]:
     return [word for value in values for word in (option, value)]
 
 
+def default_folder(name: str, stamp: str) -> Path:
+    """A folder for a run of a scenario that no other run has."""
+    names = (f"{name}-{stamp}{f'-{number}' if number > 1 else ''}" for number in count(1))
+    return next(folder for folder in (Path("runs") / one for one in names) if not folder.exists())
+
+
 def execute(order: Order, console: Console) -> None:
     """Run and write the report, whatever the end.
 
+    From here on SIGTERM and Ctrl-C end the run, and never the report.
+
     Raises:
-        LaunchError: the run failed; what was heard until then is in the report.
+        ConfigError: the folder holds a run already.
+        LaunchError: the run failed, or a file could not be written; what was heard until then is in the report.
     """
-    order.out.mkdir(parents=True, exist_ok=True)
-    text = order.path.read_bytes()
-    run = Run(order, console)
-    try:
-        run.run()
-    finally:
-        files = [*write_report(run.record, order.out, {"seed": order.seed, "speed": order.speed or "max"})]
-        files.append(keep(order.out, text, Input(order.scenario, looked_at(run.record, order.scans))))
-        last = [Status(int(history.status[-1])) for history in run.record.histories().values()]
-        outcome = ", ".join(f"{last.count(status)} {status.name.lower()}" for status in Status)
-        if run.record.plots_shed:
-            shed = ", ".join(f"{number} of {sensor}" for sensor, number in sorted(run.record.plots_shed.items()))
-            console.print(f"scans not shown because a link was full: {shed}", soft_wrap=True)
-        console.print(f"tracks: {outcome}\nreport: {', '.join(str(file) for file in files)}", soft_wrap=True)
+    refuse_used(order.out)
+    inbox = Inbox()
+    with stopped_by_signals(inbox.stop):
+        order.out.mkdir(parents=True, exist_ok=True)
+        folder = RunFolder(order.out, order.scenario, Source(order.path.read_bytes(), order.scans))
+        failures: list[str] = []
+        try:
+            Run(order, folder, console, inbox).run()
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            failures.append(describe(error))
+        finally:
+            report = folder.finish({"seed": order.seed, "speed": order.speed or "max"})
+            _tell(folder, report, console)
+        if failures := [*failures, *report.failures]:
+            raise LaunchError(f"{failures[0]}; the report is smaller for it, what it holds can be read")
+
+
+def _tell(folder: RunFolder, report: Report, console: Console) -> None:
+    """Say how a run ended and what is left of it."""
+    for what, numbers in (
+        ("scans not shown because a link was full", folder.plots_shed),
+        ("messages left out", folder.refused),
+    ):
+        if numbers:
+            told = ", ".join(f"{number} of {name}" for name, number in sorted(numbers.items()))
+            console.print(f"{what}: {told}", soft_wrap=True)
+    outcome = ", ".join(f"{folder.sketch.outcome[status]} {status.name.lower()}" for status in Status)
+    console.print(f"tracks: {outcome}\nreport: {', '.join(map(str, report.files))}", soft_wrap=True)

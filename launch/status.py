@@ -2,42 +2,65 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
+from rich import box
 from rich.console import Console, Group
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from common.config import Scenario
+from common.decision_filter import DecisionFilter
 from common.estimation.sprt import Status
 from common.messages import Decision, Tracks
+from common.quantities import NS_PER_S
 from studies.lines import decision_text
-from studies.record import Record
 
 _STYLE = {Status.TENTATIVE: "yellow", Status.CONFIRMED: "bold green", Status.DELETED: "red"}
-#: Half the width of the bar between log A and log B.
-_BAR = 24
-_ROWS = 30
+#: What matters most comes first; any other status after the confirmed.
+_RANK = {Status.CONFIRMED: 0, Status.TENTATIVE: 2, Status.DELETED: 3}
+#: Half the width of the bar between log A and log B, at most and at least.
+_BAR, _SHORT_BAR = 24, 8
+#: Columns of the table beside the bar, and what stands between columns.
+_GAPS = 2 * 5
+#: Tracks shown at most, and lines that are not of tracks.
+_ROWS, _OTHER_LINES = 30, 8
+#: How long a track that has ended is still shown [ns of measurement time].
+_ENDED_NS = 30 * NS_PER_S
+
+
+class _Row(NamedTuple):
+    """The newest of one track."""
+
+    time_ns: int
+    status: Status
+    log_lr: float
+    total: float
 
 
 class LiveStatus:
     """Shows a run while it goes on; a context manager."""
 
-    def __init__(self, record: Record, end_ns: int, console: Console) -> None:
-        """Show ``record``.
+    def __init__(self, scenario: Scenario, end_ns: int, console: Console, *, verbose: bool = False) -> None:
+        """Show a run of ``scenario``.
 
         Args:
-            record: filled by somebody else.
+            scenario: what runs.
             end_ns: measurement time of the last scan.
             console: where to.
+            verbose: tell decisions on tracks that were never confirmed too.
         """
-        self._record, self._end_ns, self._console = record, end_ns, console
+        self._scenario, self._end_ns, self._console = scenario, end_ns, console
+        self._filter = DecisionFilter(scenario, verbose=verbose)
         self._alive: set[str] = set()
-        self._last: Tracks | None = None
-        self._seen: dict[int, tuple[Status, float, float]] = {}
-        self._live = Live(console=console, refresh_per_second=8, get_renderable=self._render, transient=False)
+        self._lost: set[str] = set()
+        self._newest_ns: int | None = None
+        self._rows: dict[int, _Row] = {}
+        self._live = Live(console=console, refresh_per_second=8, get_renderable=self.render, transient=False)
 
     def __enter__(self) -> Self:
         """Begin to show."""
@@ -57,63 +80,110 @@ class LiveStatus:
         self._console.print(Text(text, style=style), soft_wrap=True)
 
     def decided(self, decision: Decision) -> None:
-        """Say what was decided."""
-        style = {"confirmed": "green", "deleted": "red"}.get(decision.kind, "yellow")
-        self.say(decision_text(decision, self._record.scenario), style)
+        """Say what was decided, if it is on a given hypothesis or on a track that was confirmed."""
+        if self._filter.passes(decision):
+            style = {"confirmed": "green", "deleted": "red"}.get(decision.kind, "yellow")
+            self.say(decision_text(decision, self._scenario), style)
 
     def present(self, sensor: str, alive: bool) -> None:
         """Note which sensors are there."""
         (self._alive.add if alive else self._alive.discard)(sensor)
 
-    def picture(self, tracks: Tracks) -> None:
-        """Note the newest picture."""
-        self._last = tracks
-        for row, track in enumerate(tracks.ids):
-            entry = (Status(tracks.status[row]), float(tracks.log_lr[row]), float(tracks.log_lr_total[row]))
-            self._seen[int(track)] = entry
+    def lose(self, sensor: str) -> None:
+        """Note that a sensor died."""
+        self._lost.add(sensor)
 
-    def _render(self) -> Group:
-        limits = self._record.scenario.decision.thresholds
-        table = Table(title=self._record.scenario.name, title_justify="left", expand=False)
-        table.add_column("track", justify="right")
-        table.add_column("status")
-        table.add_column("log LR", justify="right")
-        table.add_column(f"log A = {limits.log_a:.1f}{'0':^{2 * _BAR - 22}}log B = {limits.log_b:.1f}")
-        table.add_column("total", justify="right")
-        rows = sorted(self._seen.items())
-        for track, (status, log_lr, total) in rows[:_ROWS]:
-            bar = _bar(log_lr, limits.log_a, limits.log_b)
-            table.add_row(str(track), Text(status.name.lower(), _STYLE[status]), f"{log_lr:+.2f}", bar, f"{total:+.1f}")
-        more = [Text(f"... and {len(rows) - _ROWS} more tracks")] if len(rows) > _ROWS else []
-        return Group(table, *more, self._sensors(), self._progress())
+    def picture(self, tracks: Tracks) -> None:
+        """Note the newest picture; tracks that ended a while ago leave."""
+        self._newest_ns = tracks.time_ns
+        rows = {track: row for track, row in self._rows.items() if tracks.time_ns - row.time_ns <= _ENDED_NS}
+        columns = (tracks.ids, tracks.status, tracks.log_lr, tracks.log_lr_total)
+        for track, status, log_lr, total in zip(*(column.tolist() for column in columns), strict=True):
+            rows[track] = _Row(tracks.time_ns, Status(status), log_lr, total)
+        # The table is drawn on another thread: it sees the old rows or the new ones.
+        self._rows = rows
+
+    def __len__(self) -> int:
+        """How many tracks are remembered."""
+        return len(self._rows)
+
+    def render(self) -> Group:
+        """The table as it stands: tracks that matter most first, no line longer than the console is wide."""
+        rows = sorted(self._rows.items(), key=lambda item: (_RANK.get(item[1].status, 1), -item[0]))
+        shown = rows[: max(1, min(_ROWS, self._console.height - _OTHER_LINES))]
+        return Group(self._table(shown), self._counts(len(rows) - len(shown)), self._sensors(), self._progress())
+
+    def _table(self, rows: list[tuple[int, _Row]]) -> Table:
+        limits = self._scenario.decision.thresholds
+        cells = [(str(track), row.status.name.lower(), _number(row.log_lr), _number(row.total)) for track, row in rows]
+        heads = ("track", "status", "log LR", "total")
+        taken = sum(max(map(len, column)) for column in zip(heads, *cells, strict=True)) + _GAPS
+        half = max(_SHORT_BAR, min(_BAR, (self._console.width - taken - 1) // 2))
+        table = Table(
+            title=self._scenario.name, title_justify="left", expand=False, box=box.SIMPLE_HEAD, pad_edge=False
+        )
+        for head in heads[:3]:
+            table.add_column(head, justify="left" if head == "status" else "right", no_wrap=True)
+        table.add_column(_scale(limits.log_a, limits.log_b, half), no_wrap=True)
+        table.add_column("total", justify="right", no_wrap=True)
+        for (track, status, log_lr, total), (_, row) in zip(cells, rows, strict=True):
+            bar = _bar(row.log_lr, limits.log_a, limits.log_b, half)
+            table.add_row(track, Text(status, _STYLE.get(row.status, "cyan")), log_lr, bar, total)
+        return table
+
+    def _counts(self, hidden: int) -> Text:
+        counts = Counter(row.status for row in self._rows.values())
+        told = ", ".join(f"{counts[status]} {status.name.lower()}" for status in Status if counts[status])
+        more = f"; {hidden} of them not shown" if hidden else ""
+        return _line(Text(f"tracks  {told or 'none'}{more}"))
 
     def _sensors(self) -> Text:
-        text = Text("sensors ")
-        for name in self._record.scenario.sensor_names:
-            lost = name in self._record.lost
+        """Those that are lost first, then those that are not there, for there may be more than a line can hold."""
+        names = self._scenario.sensor_names
+        text = Text(f"sensors {len(self._alive.intersection(names))} of {len(names)}  ")
+        for name in sorted(names, key=lambda name: (name not in self._lost, name in self._alive)):
+            lost = name in self._lost
             style = "red" if lost else "green" if name in self._alive else "dim"
             text.append(f"{name}{' lost' if lost else ''}  ", style)
-        return text
+        return _line(text)
 
     def _progress(self) -> Table:
-        scenario = self._record.scenario
-        now_s = scenario.to_seconds(self._last.time_ns) if self._last is not None else 0.0
-        end_s = scenario.to_seconds(self._end_ns)
+        now_s = self._scenario.to_seconds(self._newest_ns) if self._newest_ns is not None else 0.0
+        end_s = self._scenario.to_seconds(self._end_ns)
+        told = f"{now_s:.1f} of {end_s:.1f} s"
         grid = Table.grid(padding=(0, 1))
-        grid.add_row(
-            ProgressBar(total=max(end_s, 1e-9), completed=max(now_s, 0.0), width=50), f"{now_s:.1f} of {end_s:.1f} s"
-        )
+        width = max(1, min(50, self._console.width - len(told) - 2))
+        grid.add_row(ProgressBar(total=max(end_s, 1e-9), completed=max(now_s, 0.0), width=width), told)
         return grid
 
 
-def _bar(log_lr: float, log_a: float, log_b: float) -> Text:
+def _line(text: Text) -> Text:
+    """One line, cut short where it is too long."""
+    text.no_wrap, text.overflow = True, "ellipsis"
+    return text
+
+
+def _number(value: float) -> str:
+    """A log LR in a few characters, however large it is."""
+    return f"{value:+.2f}" if abs(value) < 1e5 else f"{value:+.1e}"
+
+
+def _scale(log_a: float, log_b: float, half: int) -> str:
+    """The bar's ends and middle."""
+    left, right = (f"{name}{value:.1f}" for name, value in (("log A = ", log_a), ("log B = ", log_b)))
+    if max(len(left), len(right)) >= half:
+        left, right = f"{log_a:.1f}", f"{log_b:.1f}"
+    return f"{left:<{half}}0{right:>{half}}"
+
+
+def _bar(log_lr: float, log_a: float, log_b: float, half: int) -> Text:
     """Where log LR stands between log A (left end) and log B (right end)."""
     share = log_lr / log_b if log_lr >= 0.0 else -log_lr / log_a
-    place = round(_BAR + _BAR * max(-1.0, min(1.0, share)))
-    cells = ["·"] * (2 * _BAR + 1)
-    cells[_BAR] = "|"
-    low, high = min(place, _BAR), max(place, _BAR)
+    place = round(half + half * max(-1.0, min(1.0, share)))
+    cells = ["·"] * (2 * half + 1)
+    cells[half] = "|"
+    low, high = min(place, half), max(place, half)
     for cell in range(low, high + 1):
-        if cell != _BAR:
+        if cell != half:
             cells[cell] = "█"
     return Text("".join(cells), "green" if log_lr >= 0.0 else "red")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from common import notice
 from common.clock import now_ns
 from common.codec import decode
 from common.config import Network, Scenario
+from common.decision_filter import DecisionFilter
 from common.errors import DecodeError
 from common.estimation.sprt import Status
 from common.health import Health, age_s, answering
@@ -21,6 +23,7 @@ from common.inbox import Asked, Heard, Inbox, Incoming, Present, Stopped
 from common.logs import Complaints
 from common.messages import NEVER, Clock, Decision, Keys, Tracks, sensor_of
 from common.process import stopped_by_signals
+from common.quantities import NS_PER_S
 from common.transport import PEER_OF_ROUTER, Bus, open_zenoh
 from studies.lines import decision_entry, decision_text, finite
 
@@ -33,7 +36,16 @@ _ASK_S = 2.0
 class Watch:
     """Hears one network; ``run`` blocks until told to stop, or until the network is done."""
 
-    def __init__(self, bus: Bus, scenario: Scenario, network: Network, inbox: Inbox, *, as_json: bool = False) -> None:
+    def __init__(
+        self,
+        bus: Bus,
+        scenario: Scenario,
+        network: Network,
+        inbox: Inbox,
+        *,
+        as_json: bool = False,
+        verbose: bool = False,
+    ) -> None:
         """Set up; nothing is heard yet.
 
         Args:
@@ -42,9 +54,11 @@ class Watch:
             network: for its name, and for what to say while nobody is there.
             inbox: where somebody may have asked to stop already.
             as_json: say everything as JSON lines.
+            verbose: say to people, too, what was decided on tracks that were never confirmed; JSON lines always do.
         """
         self._bus, self._scenario, self._network, self._inbox = bus, scenario, network, inbox
         self._as_json = as_json
+        self._filter = DecisionFilter(scenario, verbose=verbose or as_json)
         self._keys = Keys(network.name)
         self._there: set[str] = set()
         self._heard_s: float | None = None
@@ -96,9 +110,10 @@ class Watch:
             return
         self._heard_s = time.monotonic()
         match message:
-            case Decision():
+            case Decision() if self._filter.passes(message):
                 entry = decision_entry(message, self._scenario)
-                self._say(decision_text(message, self._scenario), "decision", **entry)
+                text = f"{clock_text(message.time_ns)} {decision_text(message, self._scenario)}"
+                self._say(text, "decision", **entry)
             case Clock() if message.clear_ns == NEVER and not self._ended:
                 self._ended = True
                 self._say("all sources are exhausted", "end")
@@ -126,6 +141,7 @@ class Watch:
                 self._show(picture)
 
     def _show(self, picture: Tracks) -> None:
+        self._filter.learn(picture)
         time_s = self._scenario.to_seconds(picture.time_ns)
         names = [Status(status).name.lower() for status in picture.status]
         counted = ", ".join(f"{number} {name}" for name, number in sorted(Counter(names).items()))
@@ -134,7 +150,8 @@ class Watch:
             {"track": int(track), "status": name, "log_lr": finite(log_lr), "log_lr_total": finite(total)}
             for track, name, log_lr, total in rows
         ]
-        self._say(f"{time_s:8.2f} s  tracks: {counted}", "picture", time=time_s, tracks=tracks)
+        text = f"{clock_text(picture.time_ns)} {time_s:8.2f} s  tracks: {counted}"
+        self._say(text, "picture", time=time_s, tracks=tracks)
 
     def _nobody(self) -> None:
         where = ", ".join((*self._network.connect, *self._network.listen)) or "no endpoint"
@@ -153,7 +170,15 @@ class Watch:
         print(json.dumps({"event": event, **entry}) if self._as_json else text, flush=True)
 
 
-def watch(scenario: Scenario, network: Network, *, until_end: bool, as_json: bool, health: Path | None) -> None:
+def clock_text(time_ns: int) -> str:
+    """An instant as a clock in UTC shows it."""
+    whole_s, rest_ns = divmod(time_ns, NS_PER_S)
+    return f"{datetime.fromtimestamp(whole_s, UTC):%Y-%m-%d %H:%M:%S}.{rest_ns // 10_000_000:02}Z"
+
+
+def watch(
+    scenario: Scenario, network: Network, *, until_end: bool, as_json: bool, verbose: bool, health: Path | None
+) -> None:
     """Watch a network until stopped, or until it is done.
 
     Raises:
@@ -161,4 +186,4 @@ def watch(scenario: Scenario, network: Network, *, until_end: bool, as_json: boo
     """
     inbox = Inbox()
     with stopped_by_signals(inbox.stop), answering(health, inbox.asked), open_zenoh(network) as bus:
-        Watch(bus, scenario, network, inbox, as_json=as_json).run(until_end=until_end)
+        Watch(bus, scenario, network, inbox, as_json=as_json, verbose=verbose).run(until_end=until_end)

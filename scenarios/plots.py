@@ -102,20 +102,24 @@ def in_order(scans: Iterable[Scan], scenario: Scenario) -> list[Scan]:
 
 def write_plots(file: TextIO, scans: Iterable[Scan], scenario: Scenario) -> None:
     """Write scans as JSON Lines."""
-    for scan in scans:
-        config = scenario.sensor(scan.sensor)
-        relative = config.azimuth == "heading"
-        line: dict[str, Any] = {
-            "sensor": scan.sensor,
-            "time": scenario.to_seconds(scan.time_ns),
-            "position": scan.position.tolist(),
-        }
-        if len(scan.velocity):
-            line["velocity"] = scan.velocity.tolist()
-        if relative or scan.heading != (config.heading or 0.0):
-            line["heading"] = scan.heading
-        line["plots"] = (_turned(scan.z, config, -scan.heading) if relative else scan.z).tolist()
-        file.write(json.dumps(line) + "\n")
+    file.writelines(plots_line(scan, scenario) + "\n" for scan in scans)
+
+
+def plots_line(scan: Scan, scenario: Scenario) -> str:
+    """A scan as JSON."""
+    config = scenario.sensor(scan.sensor)
+    relative = config.azimuth == "heading"
+    line: dict[str, Any] = {
+        "sensor": scan.sensor,
+        "time": scenario.to_seconds(scan.time_ns),
+        "position": scan.position.tolist(),
+    }
+    if len(scan.velocity):
+        line["velocity"] = scan.velocity.tolist()
+    if relative or scan.heading != (config.heading or 0.0):
+        line["heading"] = scan.heading
+    line["plots"] = (_turned(scan.z, config, -scan.heading) if relative else scan.z).tolist()
+    return json.dumps(line)
 
 
 def _parse(entry: dict[str, Any], scenario: Scenario) -> Scan | None:

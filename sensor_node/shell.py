@@ -69,6 +69,7 @@ class NodeShell:
         self._advised_ns: int | None = None
         self._center = self._new_center = False
         self._answered = self._stopped = False
+        self._epoch: int | None = None
         self._began_ns = self._joined_ns = self._ask_ns = 0
         self._gone_ns: int | None = None
         self._reported_s: float | None = None
@@ -227,7 +228,9 @@ class NodeShell:
         match message:
             case Start():
                 self._answered = True
-                self._log.info("tracks started", tracks=message.ids.tolist(), epoch=message.epoch)
+                if message.epoch != self._epoch:  # a node on a bad link asks for the same again and again
+                    self._log.info("tracks started", tracks=len(message.ids), epoch=message.epoch)
+                self._epoch = message.epoch
                 return
             case Begin() if not self._tracker.advised:
                 given_ns = message.given_ns

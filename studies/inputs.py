@@ -5,14 +5,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
 from common.config import Scenario, load_scenario
+from common.files import LinesFile, write_atomically
 from common.messages import Scan
-from scenarios.plots import read_plots, write_plots
-from studies.record import Record
+from scenarios.plots import plots_line, read_plots
 
 _FOLDER, _SCENARIO, _PLOTS = "input", "scenario.toml", "plots.jsonl"
 
@@ -29,40 +30,68 @@ class Input(NamedTuple):
     scans: list[Scan]
 
 
-def looked_at(record: Record, scans: Iterable[Scan]) -> list[Scan]:
-    """The plots that a run went on.
+class Source(NamedTuple):
+    """What a run will go on.
+
+    Attributes:
+        text: of the scenario's file.
+        scans: of all sources, by time.
+    """
+
+    text: bytes
+    scans: Iterable[Scan]
+
+
+class InputFolder:
+    """Writes the plots that a run goes on, as it goes on.
 
     The sources tell them all, whatever links shed of what the sensors show: those up to the last measurement time that
     was worked in; of a sensor that died, up to the last scan that it showed.
-
-    Args:
-        record: of the run.
-        scans: of its sources, by time.
     """
-    until_ns = dict.fromkeys(record.scenario.sensor_names, max(record.pictures, default=0))
-    for name in record.lost:
-        shown = (scan.time_ns for scan in record.scans if scan.sensor == name)
-        until_ns[name] = min(until_ns[name], max(shown, default=0))
-    return [scan for scan in scans if scan.time_ns <= until_ns[scan.sensor]]
 
+    def __init__(self, folder: Path, source: Source, scenario: Scenario) -> None:
+        """Write the scenario into the folder of a run.
 
-def keep(folder: Path, text: bytes, of: Input) -> Path:
-    """Write what a run went on into its folder.
+        Raises:
+            OSError: a file cannot be written, or the plots are there already.
+        """
+        self.path = folder / _FOLDER
+        self.path.mkdir(exist_ok=True)
+        write_atomically(self.path / _SCENARIO, source.text)
+        self._plots = LinesFile(self.path / _PLOTS)
+        self._scenario = scenario
+        self._to_come = deque(source.scans)
+        self._shown_ns: dict[str, int] = {}
+        self.end_ns = self._to_come[-1].time_ns if self._to_come else scenario.epoch_ns
 
-    Args:
-        folder: of the run; must exist.
-        text: of the scenario's file.
-        of: the run.
+    def show(self, scan: Scan) -> None:
+        """Note what a sensor showed: it was alive until then."""
+        self._shown_ns[scan.sensor] = max(scan.time_ns, self._shown_ns.get(scan.sensor, 0))
 
-    Returns:
-        the folder written to.
-    """
-    inside = folder / _FOLDER
-    inside.mkdir(exist_ok=True)
-    (inside / _SCENARIO).write_bytes(text)
-    with (inside / _PLOTS).open("w", encoding="utf-8") as file:
-        write_plots(file, of.scans, of.scenario)
-    return inside
+    def write_until(self, time_ns: int, lost: Collection[str]) -> None:
+        """Write the plots up to a measurement time, as far as their sensors are known to have seen them.
+
+        Args:
+            time_ns: of a picture that is final.
+            lost: the sensors that died.
+        """
+        while self._to_come and (scan := self._to_come[0]).time_ns <= time_ns:
+            if not self._seen(scan):
+                if scan.sensor not in lost:
+                    return
+            else:
+                self._plots.append([plots_line(scan, self._scenario)])
+            self._to_come.popleft()
+
+    def finish(self, time_ns: int, lost: Collection[str]) -> None:
+        """Write what is left up to the last measurement time; ``lost``: the sensors that died."""
+        with self._plots:
+            for scan in self._to_come:
+                if scan.time_ns <= time_ns and (scan.sensor not in lost or self._seen(scan)):
+                    self._plots.append([plots_line(scan, self._scenario)])
+
+    def _seen(self, scan: Scan) -> bool:
+        return scan.time_ns <= self._shown_ns.get(scan.sensor, 0)
 
 
 def kept(folder: Path) -> Input | None:

@@ -38,6 +38,10 @@ class TrackLines:
 
     def of(self, tracks: Tracks) -> Iterator[str]:
         """The lines of one measurement time, by track."""
+        return (line for _, line in self.by_track(tracks))
+
+    def by_track(self, tracks: Tracks) -> Iterator[tuple[int, str]]:
+        """The lines of one measurement time, each with its track, by track."""
         time_s = self._scenario.to_seconds(tracks.time_ns)
         entries = dict(zip(tracks.ids.tolist(), _entries(tracks), strict=True))
         if self._lag is not None:
@@ -50,7 +54,7 @@ class TrackLines:
         for track, entry in sorted({**self._deleted, **entries}.items()):
             if entry["status"] == "deleted" and self._scenario.initiation is None:
                 self._deleted[track] = entry
-            yield json.dumps({"time": time_s, "track": track, **entry}, allow_nan=False)
+            yield track, json.dumps({"time": time_s, "track": track, **entry}, allow_nan=False)
 
 
 def _entries(tracks: Tracks) -> Iterator[dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import os
 import shutil
 import zipfile
 import zlib
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from common.errors import ConfigError
+from common.files import write_atomically
 from studies.metrics import Result
 from studies.plan import Job, part_digest
 
@@ -111,13 +111,3 @@ class Store:
     def _path(self, job: Job, mode: str) -> Path:
         name = f"{job.first:07d}-{job.first + len(job.seeds) - 1:07d}.npz"
         return self.folder / "parts" / job.variant.name / mode / name
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that a reader finds the old one or the new one, never a half."""
-    draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        draft.write_bytes(content)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)

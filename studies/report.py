@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from studies.parts import write_atomically
+from common.files import write_atomically
 from studies.plan import Variant
 from studies.progress import figure as words
 from studies.report_figures import (

@@ -12,9 +12,10 @@ import numpy as np
 
 from common.config import Scenario
 from common.errors import StudyError
+from common.files import write_atomically
 from studies import calibration, tables
 from studies.metrics import Result
-from studies.parts import Store, write_atomically
+from studies.parts import Store
 from studies.plan import (
     Job,
     Order,

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from common.estimation.gaussian import Array
 from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Status, StatusArray, Thresholds, thresholds
+from common.files import write_atomically
 from common.messages import IntArray
 from studies.metrics import Decided, Evidence, Result, evidence, first_decisions, gospa_per_scan, lost, monitor
-from studies.parts import write_atomically
 from studies.plan import Variant
 from studies.shares import mean, quantile, share_of
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,9 +18,11 @@ from sensor_node.sources import schedule_of
 from sensor_node.state import Schedule
 from sensor_node.state import State as NodeState
 from sensor_node.tracker import LocalTracker
+from studies.inputs import Source
 from studies.network import run_in_memory
 from studies.record import Record
 from studies.replay import Replay
+from studies.run_folder import RunFolder
 
 BOX = {"shape": "box", "center": [0.0, 0.0], "size": [20_000.0, 20_000.0]}
 
@@ -86,6 +89,18 @@ def live_as_replayed(plot: Scenario, scans: Sequence[Scan]) -> Record:
     assert live.pictures.keys() == replayed.pictures.keys()
     assert all_same(list(live.pictures.values()), list(replayed.pictures.values()))
     return live
+
+
+def write_report(record: Record, folder: Path, extra: Mapping[str, Any], source: Source | None = None) -> list[Path]:
+    """The folder of a run in which everything of a record was heard; the files that a run leaves."""
+    written = RunFolder(folder, record.scenario, source)
+    for time_ns in sorted(record.pictures):
+        written.note(record.pictures[time_ns])
+    for message in (*record.decisions, *record.scans):
+        written.note(message)
+    report = written.finish(extra)
+    assert not report.failures
+    return report.files
 
 
 def only(kind: type[Any], messages: Iterable[Message]) -> list[Any]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import scenario
+from builders import only, scenario, write_report
 
 from common.config import load_scenario
 from common.errors import EvaluationError, TruthError
@@ -21,9 +21,10 @@ from scenarios.truth import read_truth, write_truth
 from scenarios.world import simulate_all, truth
 from studies.evaluate.runs import names, read_run
 from studies.evaluate.yardstick import centralised
-from studies.inputs import Input, keep, kept, looked_at
-from studies.record import Record, write_report
+from studies.inputs import Source, kept
+from studies.record import Record
 from studies.replay import Replay
+from studies.run_folder import RunFolder
 
 LINE: dict[str, Any] = {"time": 2.0, "track": 5, "status": "confirmed", "x": [1.0, 2.0, 3.0, 4.0], "P": []}
 POINT: dict[str, Any] = {"target": 1, "time": 2.0, "position": [1.0, 2.0]}
@@ -109,12 +110,14 @@ def test_a_folder_tells_when_it_was_measured(tmp_path: Path) -> None:
     record = Record(scenario())
     none = Tracks(0, ("a",), *(np.empty(0, np.int64) for _ in range(8)))  # type: ignore[arg-type]
     for second in (1, 2, 3):
-        record.note(none._replace(time_ns=record.scenario.to_ns(float(second))))
-    write(tmp_path / "tracks.jsonl")
-    assert read_run(tmp_path, 2).span_s is None
-    write(tmp_path / "decisions.json", record.summary({}))
+        record.note(none._replace(x=np.empty((0, 4)), time_ns=record.scenario.to_ns(float(second))))
+    write_report(record, tmp_path, {})
+    assert (tmp_path / "tracks.jsonl").read_text() == ""
     assert read_run(tmp_path, 2).span_s == (1.0, 3.0)
-    write(tmp_path / "decisions.json", Record(scenario()).summary({}))
+    (tmp_path / "nothing").mkdir()
+    write_report(Record(scenario()), tmp_path / "nothing", {})
+    assert read_run(tmp_path / "nothing", 2).span_s is None
+    (tmp_path / "decisions.json").unlink()
     assert read_run(tmp_path, 2).span_s is None
 
 
@@ -201,8 +204,7 @@ def recorded(folder: Path, plot: str, seed: int = 1) -> Path:
     folder.mkdir()
     for message in Replay(loaded, scans).run():
         record.note(message)
-    write_report(record, folder, {"seed": seed})
-    keep(folder, find(plot).read_bytes(), Input(loaded, looked_at(record, scans)))
+    write_report(record, folder, {"seed": seed}, Source(find(plot).read_bytes(), scans))
     with (folder / "truth.jsonl").open("w") as file:
         write_truth(file, *truth(loaded, seed), loaded)
     return folder
@@ -306,29 +308,34 @@ def test_a_scenario_for_runs_that_keep_theirs_is_refused(tmp_path: Path, capsys:
 def test_plots_that_nobody_worked_in_are_not_kept(tmp_path: Path) -> None:
     """A run that was stopped, and of which a sensor had died before."""
     loaded = load_scenario(find("four-radars"))
-    scans, record = simulate_all(loaded, 1), Record(loaded)
+    scans = simulate_all(loaded, 1)
     first, *_, last = loaded.sensor_names
     stop_ns = scans[-1].time_ns // 2 + scans[0].time_ns // 2
-    for scan in scans:
+    source = Source(find("four-radars").read_bytes(), scans)
+    run, nothing = tmp_path / "run", tmp_path / "nothing"
+    for folder in (run, nothing):
+        folder.mkdir()
+    written = RunFolder(run, loaded, source)
+    for scan in scans[1:]:  # the first one was shed by a link
         if scan.time_ns <= stop_ns - (10**10 if scan.sensor == last else 0):
-            record.note(scan)
-    for message in Replay(loaded, [scan for scan in scans if scan.time_ns <= stop_ns]).run():
-        record.note(message)
-    record.lost[last] = "killed"
-    record.scans.remove(record.scans[0])  # shed by a link
-    keep(tmp_path, find("four-radars").read_bytes(), Input(loaded, looked_at(record, scans)))
-    found = kept(tmp_path)
+            written.note(scan)
+    written.lost[last] = "killed"
+    pictures = only(Tracks, Replay(loaded, [scan for scan in scans if scan.time_ns <= stop_ns]).run())
+    for picture in pictures:
+        written.note(picture)
+    assert not written.finish({}).failures
+    found = kept(run)
     assert found is not None
     shown = {name: [scan.time_ns for scan in found.scans if scan.sensor == name] for name in (first, last)}
-    assert max(shown[first]) == max(time_ns for time_ns in record.pictures) <= stop_ns
+    assert max(shown[first]) == pictures[-1].time_ns <= stop_ns
     assert stop_ns - 12 * 10**9 < max(shown[last]) <= stop_ns - 10**10
     assert len(shown[first]) == len([scan for scan in scans if scan.sensor == first and scan.time_ns <= stop_ns])
     # Of a run in which nothing was worked in nothing is kept; and it can be judged.
-    keep(tmp_path, find("four-radars").read_bytes(), Input(loaded, looked_at(Record(loaded), scans)))
-    nothing = kept(tmp_path)
-    assert nothing is not None
-    assert nothing.scans == []
-    assert centralised(nothing, ("none",), 2).span_s is None
+    RunFolder(nothing, loaded, source).finish({})
+    none = kept(nothing)
+    assert none is not None
+    assert none.scans == []
+    assert centralised(none, ("none",), 2).span_s is None
 
 
 @pytest.mark.parametrize(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import io
+import json
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
-from builders import Stage, reports_of, scenario
+from builders import Stage, reports_of, scenario, write_report
 from process_helpers import PATIENCE_S, variant
 from rich.console import Console
 from structlog.testing import capture_logs
@@ -18,7 +19,7 @@ from common.codec import encode
 from common.config import load_scenario
 from common.errors import ConfigError, WaldnetError
 from common.estimation.sprt import Status
-from common.inbox import Missed
+from common.inbox import Inbox, Missed
 from common.memory import MemoryNetwork
 from common.messages import Decision, Keys, Scan, Start, Tracks
 from fusion_center.center import Center
@@ -27,7 +28,8 @@ from launch.run import Order, Run
 from launch.status import LiveStatus
 from sensor_node.shell import NodeShell
 from sensor_node.tracker import LocalTracker
-from studies.record import Record, write_report
+from studies.record import Record
+from studies.run_folder import RunFolder
 
 
 def picture(time_s: float, tracks: dict[int, Status]) -> Tracks:
@@ -48,7 +50,7 @@ def picture(time_s: float, tracks: dict[int, Status]) -> Tracks:
 
 def test_the_live_status_misses_nothing_between_two_refreshes() -> None:
     screen, plot = io.StringIO(), scenario()
-    status = LiveStatus(Record(plot), plot.to_ns(20.0), Console(file=screen, force_terminal=True, width=120))
+    status = LiveStatus(plot, plot.to_ns(20.0), Console(file=screen, force_terminal=True, width=120))
     with status:
         status.picture(picture(2.0, {0: Status.CONFIRMED, 1: Status.DELETED}))
         status.picture(picture(4.0, {0: Status.CONFIRMED}))
@@ -57,11 +59,11 @@ def test_the_live_status_misses_nothing_between_two_refreshes() -> None:
 
 def test_what_is_said_into_a_file_is_one_line() -> None:
     file, plot = io.StringIO(), scenario()
-    LiveStatus(Record(plot), plot.to_ns(20.0), Console(file=file, width=80)).say(30 * "a long story ")
+    LiveStatus(plot, plot.to_ns(20.0), Console(file=file, width=80)).say(30 * "a long story ")
     assert file.getvalue().count("\n") == 1
 
 
-def test_a_deletion_that_a_late_report_brings_forward_is_kept() -> None:
+def test_a_deletion_that_a_late_report_brings_forward_is_kept(tmp_path: Path) -> None:
     """The picture of that time must be told anew, or the track would be tentative in the record for ever."""
     stage = Stage(scenario(), speed=1.0)
     starts = stage.join_all()
@@ -85,7 +87,8 @@ def test_a_deletion_that_a_late_report_brings_forward_is_kept() -> None:
     assert [(decision.kind, stage.scenario.to_seconds(decision.time_ns)) for decision in record.standing()] == [
         ("deleted", 2.0)
     ]
-    assert record.summary({})["tracks"][0]["status"] == "deleted"
+    write_report(record, tmp_path, {})
+    assert json.loads((tmp_path / "decisions.json").read_text())["tracks"][0]["status"] == "deleted"
 
 
 def test_a_report_of_a_decision_whose_picture_was_never_heard(tmp_path: Path) -> None:
@@ -97,10 +100,12 @@ def test_a_report_of_a_decision_whose_picture_was_never_heard(tmp_path: Path) ->
 
 def test_plots_that_were_shed_are_told_once_and_counted(tmp_path: Path) -> None:
     plot, said = scenario(), io.StringIO()
-    run = Run(Order(plot, tmp_path, None, 1, 0.0, tmp_path, ()), Console(file=said, width=200))
+    folder = RunFolder(tmp_path, plot)
+    run = Run(Order(plot, tmp_path, None, 1, 0.0, tmp_path, ()), folder, Console(file=said, width=200), Inbox())
     for number in (2, 3):
         run._work_off(Missed(Keys(plot.network.name).plots("a"), number))
-    assert run.record.summary({})["plots_shed"] == {"a": 5}
+    folder.finish({})
+    assert json.loads((tmp_path / "decisions.json").read_text())["plots_shed"] == {"a": 5}
     assert said.getvalue().splitlines() == ["a: not all plots are shown, its link is full: reports go first"]
 
 

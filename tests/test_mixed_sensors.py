@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import all_same, scenario, sensor_table
+from builders import all_same, scenario, sensor_table, write_report
 from scipy import stats
 
 from common.config import Scenario, load_scenario
@@ -20,7 +20,7 @@ from scenarios import catalogue
 from scenarios.plots import read_plots, write_plots
 from scenarios.world import simulate, simulate_all, truth
 from studies.network import run_in_memory
-from studies.record import Record, write_report
+from studies.record import Record
 from studies.replay import Replay
 
 #: Probability that a statistical test fails though the code is right; seeds are fixed, so it fails always or never.

@@ -6,11 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
-from builders import scenario, sensor_table
+from builders import scenario, sensor_table, write_report
 
 from scenarios.world import simulate_all
-from studies import figures
-from studies.record import Record, write_report
+from studies import figures, sketch
+from studies.record import Record
 from studies.replay import Replay
 
 
@@ -21,17 +21,24 @@ def test_of_many_tracks_those_that_were_confirmed_are_drawn(tmp_path: Path, monk
     record = Record(plot)
     for message in Replay(plot, simulate_all(plot, 1)).run():
         record.note(message)
-    histories = record.histories()
+    tracks = {track for picture in record.pictures.values() for track in picture.ids.tolist()}
     confirmed = {decision.track for decision in record.standing() if decision.kind == "confirmed"}
-    assert len(confirmed) < len(histories)
-    assert figures._drawn(histories) == histories
-    monkeypatch.setattr(figures, "_MOST_TRACKS", 3)
-    assert set(figures._drawn(histories)) == confirmed
-    labels = [handle.get_label() for handle in figures._status_handles(histories)]
-    assert f"{len(histories) - len(confirmed)} never confirmed, not drawn" in labels
+    assert len(confirmed) < len(tracks)
+    assert set(sketched(record).histories()) == tracks
+    monkeypatch.setattr(sketch, "MOST_TRACKS", 3)
+    assert set(sketched(record).histories()) == confirmed
+    labels = [handle.get_label() for handle in figures._status_handles(sketched(record))]
+    assert f"{len(tracks) - len(confirmed)} never confirmed, not drawn" in labels
     write_report(record, tmp_path, {})
     told = json.loads((tmp_path / "decisions.json").read_text())
     for entry in told["tracks"]:
         own = [decision for decision in record.standing() if decision.track == entry["track"]]
         assert [decision["kind"] for decision in entry["decisions"]] == [decision.kind for decision in own]
     assert (tmp_path / "log_lr.png").read_bytes().startswith(b"\x89PNG")
+
+
+def sketched(record: Record) -> sketch.Sketch:
+    drawn = sketch.Sketch(record.scenario)
+    for time_ns in sorted(record.pictures):
+        drawn.add_picture(record.pictures[time_ns])
+    return drawn

@@ -54,7 +54,7 @@ def test_to_the_end(processes: Processes) -> None:
     assert [process.wait() for process in (*watches, center.process, *nodes.values())] == 7 * [0]
     people, machines = (watch.out for watch in watches)
     assert [watch.err for watch in watches] == [[], []]
-    assert "    2.00 s  track 0 confirmed after 1 scans, log LR +33.33" in people
+    assert "2026-01-01 00:00:02.00Z     2.00 s  track 0 confirmed after 1 scans, log LR +33.33" in people
     assert sum(" deleted after " in line for line in people) == 4
     assert people.count("all sources are exhausted") == 1
     entries = list(log_entries(machines))

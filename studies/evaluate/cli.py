@@ -10,6 +10,7 @@ from cyclopts import Parameter, validators
 
 from common.config import load_scenario
 from common.errors import EvaluationError
+from common.files import write_atomically
 
 if TYPE_CHECKING:
     from studies.inputs import Input
@@ -84,7 +85,7 @@ def evaluate(
     text = json.dumps(entry, allow_nan=False)
     picture = figure or _default(run, several=bool(others))
     draw(evaluations, cutoff, window, picture)
-    picture.with_suffix(".json").write_text(text + "\n", encoding="utf-8")
+    write_atomically(picture.with_suffix(".json"), f"{text}\n".encode())
     console = Console(highlight=False, markup=False)
     if as_json:
         console.out(text)

@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from common.estimation.gaussian import Array
+from common.files import replacing
 from studies.evaluate.evaluation import Evaluation
 from studies.evaluate.paths import Paths
 from studies.report_style import BLACK, BLUE, GREEN, ORANGE, PURPLE, QUIET, SETTINGS, SKY
@@ -58,7 +59,8 @@ def draw(evaluations: Sequence[Evaluation], cutoff_m: float, window_s: float, pa
         for axes in panels[len(evaluations) :]:
             axes.remove()
         plan.legend(handles=_plan_handles(), loc="outside lower center", ncols=3)
-        figure.savefig(path, dpi=110)
+        with replacing(path) as file:
+            figure.savefig(file, dpi=110, format=path.suffix.lstrip(".") or "png")
 
 
 def _extent(evaluations: Sequence[Evaluation]) -> Array:

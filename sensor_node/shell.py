@@ -220,7 +220,7 @@ class NodeShell:
             self._log.warning("notice", why=told.text)
         elif told.digest == self._tracker.digest:
             parts = [part for part, mine in self._tracker.digests.items() if told.digests.get(part) != mine]
-            differ = f" ({', '.join(parts)} differ)" if parts else ""
+            differ = f" ({', '.join(parts)} {'differs' if len(parts) == 1 else 'differ'})" if parts else ""
             raise ConfigError(f"{told.text}{differ}; all processes of a network need the same scenario file")
 
     def _note(self, message: Start | Begin | Stop | Advice | Rebase) -> None:

@@ -172,6 +172,8 @@ class CenterShell:
         if self._state.clock is not None and before.clock is None:
             absent = [n for n, m in zip(self._center.names, self._state.members, strict=True) if not m.joined]
             self._log.info("clock started", speed=self._center.speed or "lockstep", without=absent)
+            for name in absent:
+                self._publish_notice(Notice("silent", name, f"{name} has not joined: the clock starts without it"))
         if self._inbox.empty:
             self._state = self._center.prepare(self._state)
 

@@ -141,6 +141,12 @@ def test_a_refusal_is_told_once_and_summed_up_in_the_end() -> None:
     ]
 
 
+def test_those_without_whom_the_clock_starts_are_named() -> None:
+    with running(scenario(), wait_s=0.0) as network:
+        told = network.sensor("a", 2.0).await_notice("silent")
+    assert told.text == "b has not joined: the clock starts without it"
+
+
 @pytest.mark.parametrize("offset_s", [3.0, -3.0])
 def test_the_sensor_whose_clock_is_wrong_is_told_of(offset_s: float) -> None:
     plot = scenario(hypothesis=[], target=[], fusion={"hold_back": 0.5, "window": 1000.0})

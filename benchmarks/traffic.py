@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from benchmarks.worlds import World
-from common.codec import encode
+from common.codec import Rounding, encode
 from common.config import Network
 from common.messages import Join, Keys, Message, Report, Scan, Start
 from common.transport import open_zenoh
@@ -91,7 +91,7 @@ def sensor(world: World, name: str, kind: str, address: str) -> None:
     payloads, key = [], ""
     for message in messages(world, name, kind):
         key = _KEYS.of(message)
-        payloads.append(encode(message, rounded=world.precision == "float32"))
+        payloads.append(encode(message, rounding=Rounding(2, plots=True) if world.precision == "float32" else None))
     with open_zenoh(Network(name="bench", connect=(f"tcp/{address}:{PORT}",))) as bus:
         here = threading.Event()
         bus.watch(_KEYS.center_alive(), lambda *_: here.set())

@@ -26,6 +26,7 @@ from common.messages import (
     Decision,
     DecisionKind,
     Join,
+    Keys,
     Message,
     Picked,
     Rebase,
@@ -48,20 +49,34 @@ class Block(NamedTuple):
         dtype: on the wire, little-endian.
         axes: names of its axes; ``n^`` is a symmetric pair of axes n, sent as the upper triangle.
         kind: dtype in memory.
+        relative: the positions that its rows begin with are sent relative to ``reference``, which no message has.
     """
 
     field: str
     dtype: str
     axes: tuple[str, ...]
     kind: str = "f8"
+    relative: bool = False
+
+
+class Rounding(NamedTuple):
+    """How a report is sent in single precision: its positions relative to one near all of them.
+
+    Attributes:
+        dimensions: of a position, which states begin with.
+        plots: whether plots are positions too.
+    """
+
+    dimensions: int
+    plots: bool
 
 
 def _floats(field: str, *axes: str) -> Block:
     return Block(field, "<f8", axes)
 
 
-def _unclaimed(dtype: str) -> tuple[Block, ...]:
-    return _floats("position", "d"), Block("unclaimed", dtype, ("U", "m"))
+def _unclaimed(dtype: str, *, relative: bool = False) -> tuple[Block, ...]:
+    return _floats("position", "d"), Block("unclaimed", dtype, ("U", "m"), relative=relative)
 
 
 _IDS = Block("ids", "<u4", ("T",), "i8")
@@ -75,25 +90,31 @@ _BEGUN = (
 )
 _PICKED = (Block("plots", "<u2", ("T",), "i8"), Block("which", "<u2", ("N",), "i8"))
 
-#: Kinds of reports whose densities or plots are rounded; log g, which grows without end, is not.
-ROUNDED, ROUNDED_PLOTS = 10, 14
+#: Where it is no more than a few times their distance from each other to them, single precision holds positions.
+_REFERENCE = Block("reference", "<f4", ("r",))
+
+
+def _rounded_report(*, plots: bool) -> tuple[type, tuple[Block, ...]]:
+    """A report with rounded densities and plots, which may be positions; log g, which grows without end, is not."""
+    densities = Block("x", "<f4", ("N", "n"), relative=True), Block("P", "<f4", ("N", "n^"))
+    unclaimed = _unclaimed("<f4", relative=plots)
+    return Report, (_IDS, _TERMS, _floats("log_g", "N"), *densities, *unclaimed, _REFERENCE)
+
+
+def _rounded_picked(*, plots: bool) -> tuple[type, tuple[Block, ...]]:
+    """Picked plots, rounded, which may be positions."""
+    z, reference = Block("z", "<f4", ("M", "m"), relative=plots), (_REFERENCE,) if plots else ()
+    return Picked, (_IDS, *_PICKED, z, *_unclaimed("<f4", relative=plots), *reference)
+
+
+#: Kinds of rounded reports, by their type and whether their plots are positions.
+ROUNDED = {(Report, True): 10, (Report, False): 15, (Picked, True): 14, (Picked, False): 16}
 
 #: Blocks of every kind of message; the number is the kind on the wire.
 LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
     1: (
         Report,
         (_IDS, _TERMS, _floats("log_g", "N"), _floats("x", "N", "n"), _floats("P", "N", "n^"), *_unclaimed("<f8")),
-    ),
-    ROUNDED: (
-        Report,
-        (
-            _IDS,
-            _TERMS,
-            _floats("log_g", "N"),
-            Block("x", "<f4", ("N", "n")),
-            Block("P", "<f4", ("N", "n^")),
-            *_unclaimed("<f4"),
-        ),
     ),
     2: (Scan, (_floats("position", "d"), _floats("z", "M", "m"))),
     3: (Join, ()),
@@ -128,11 +149,11 @@ LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
     9: (Decision, ()),
     11: (Begin, _BEGUN),
     13: (Picked, (_IDS, *_PICKED, _floats("z", "M", "m"), *_unclaimed("<f8"))),
-    ROUNDED_PLOTS: (Picked, (_IDS, *_PICKED, Block("z", "<f4", ("M", "m")), *_unclaimed("<f4"))),
     12: (Rebase, (_IDS, _floats("x", "T", "n"), _floats("P", "T", "n^"))),
+    **{ROUNDED[Report, plots]: _rounded_report(plots=plots) for plots in (True, False)},
+    **{ROUNDED[Picked, plots]: _rounded_picked(plots=plots) for plots in (True, False)},
 }
-_KINDS = {message: kind for kind, (message, _) in LAYOUTS.items() if kind not in (ROUNDED, ROUNDED_PLOTS)}
-_ROUNDED = {Report: ROUNDED, Picked: ROUNDED_PLOTS}
+_KINDS = {message: kind for kind, (message, _) in LAYOUTS.items() if kind not in ROUNDED.values()}
 #: No state is larger; keeps a forged header from asking for memory.
 _MAX_STATE = 64
 #: Messages whose sensor is the one in the key.
@@ -151,29 +172,33 @@ _EXPECTED = {"int": "a 64-bit integer", "float": "a finite float", "str": "a tex
 _AnyArray: TypeAlias = NDArray[Any]
 
 
-def encode(message: Message, *, rounded: bool = False) -> bytes:
+def encode(message: Message, *, rounding: Rounding | None = None) -> bytes:
     """A message as bytes.
 
     Args:
         message: to send.
-        rounded: send the densities or plots of a report in single precision.
+        rounding: how to send the densities or plots of a report in single precision; None: in double precision.
 
     Returns:
         the payload; the name of the sensor it comes from or goes to is in the key instead.
     """
     kind = _KINDS[type(message)]
-    if rounded:
-        kind = _ROUNDED.get(type(message), kind)
+    if rounding is not None:
+        kind = ROUNDED.get((type(message), rounding.plots), kind)
+    reference = _reference(message, kind, rounding.dimensions if rounding else 0)
     sizes: dict[str, int] = {}
     raw = []
     for block in LAYOUTS[kind][1]:
-        array: _AnyArray = getattr(message, block.field)
+        array: _AnyArray = reference if block is _REFERENCE else getattr(message, block.field)
+        if block.relative and len(array):
+            array = array.copy()
+            array[:, : len(reference)] -= reference
         for axis, size in zip(block.axes, array.shape, strict=False):
             assert sizes.setdefault(axis.rstrip("^"), size) == size, (
                 f"{block.field} is not as long as others along {axis}"
             )
         if block.axes[-1].endswith("^"):
-            array = array[..., *_upper(array.shape[-1])]
+            array = _holding(array, block.dtype)[..., *_upper(array.shape[-1])]
         wire = np.ascontiguousarray(array, dtype=block.dtype)
         assert wire.dtype.kind != "u" or (wire == array).all(), f"{block.field} does not fit into {block.dtype}"
         raw.append(wire.tobytes())
@@ -182,6 +207,37 @@ def encode(message: Message, *, rounded: bool = False) -> bytes:
     if optional and not any(scalars[-optional:]):
         del scalars[-optional:]
     return bytes(msgpack.packb([VERSION, kind, scalars, list(sizes.values()), b"".join(raw), *_pose(message)]))
+
+
+def as_sent(report: Report | Picked, rounding: Rounding | None) -> Report | Picked:
+    """A report as the center gets it: rounded, if it is rounded on the way."""
+    if rounding is None:
+        return report
+    sent = decode(Keys("sent").of(report), encode(report, rounding=rounding))
+    assert isinstance(sent, Report | Picked)
+    return sent
+
+
+def _reference(message: Message, kind: int, dimensions: int) -> _AnyArray:
+    """A position near all that are sent relative to it, shape (d,); where there are none, shape (0,).
+
+    It is one of single precision itself, and the median, so that one that is far off takes nothing from the others.
+    """
+    relative = [getattr(message, block.field)[:, :dimensions] for block in LAYOUTS[kind][1] if block.relative]
+    places = [array for array in relative if len(array)]
+    return np.median(np.concatenate(places), axis=0).astype("<f4").astype(np.float64) if places else np.empty(0)
+
+
+def _holding(P: _AnyArray, dtype: str) -> _AnyArray:
+    """Covariances so much larger that they stay positive definite when they are rounded, shape (..., n, n).
+
+    Rounding moves an element by 2^-24 of itself at most, so the correlation matrix by n 2^-24 at most.
+    """
+    if dtype != "<f4":
+        return P
+    n = P.shape[-1]
+    larger: _AnyArray = P * (1.0 + (n + 2.0) * 2.0**-24 * np.eye(n))
+    return larger
 
 
 def _pose(message: Message) -> list[bytes]:
@@ -284,6 +340,12 @@ def _decode_blocks(kind: int, sizes: Any, blocks: Any) -> dict[str, _AnyArray]:
     for block, place in zip(LAYOUTS[kind][1], places, strict=True):
         array = np.frombuffer(blocks, block.dtype, place.numbers, place.offset).astype(block.kind).reshape(place.shape)
         fields[block.field] = array if place.full is None else array[..., place.full]
+    reference = fields.pop(_REFERENCE.field, np.empty(0))
+    for block in LAYOUTS[kind][1]:
+        if block.relative and len(array := fields[block.field]):
+            if len(reference) > array.shape[1]:
+                raise DecodeError(f"a reference of {len(reference)} numbers, {block.field} has {array.shape[1]}")
+            array[:, : len(reference)] += reference
     return fields
 
 

@@ -310,5 +310,5 @@ class NodeShell:
         return self._position == len(self._scans)
 
     def _publish(self, message: Message) -> bool:
-        payload = encode(message, rounded=self._tracker.rounded)
+        payload = encode(message, rounding=self._tracker.rounding)
         return self._publishers[self._keys.of(message)].put(payload)

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.config import Scenario
+from common.codec import Rounding
+from common.config import Scenario, SensorConfig
 from common.estimation import clutter_map
 from common.estimation.association import Expected, Plots
 from common.estimation.batch import concatenate, take
@@ -41,7 +42,7 @@ class LocalTracker:
             (theory.md §3, 6), or with those that begin (§8).
         advised: that answer is advice or to begin anew.
         believing: it is kept how surely tracks exist.
-        rounded: reports are in single precision.
+        rounding: how its reports are sent in single precision; None: they are not.
         selection: which plots are sent, where the center tracks; else None.
         digest: of what the center must have in common with this node.
         digests: of its parts, by name.
@@ -56,7 +57,7 @@ class LocalTracker:
     feedback: bool
     advised: bool
     believing: bool
-    rounded: bool
+    rounding: Rounding | None
     selection: Selection | None
     digest: str
     digests: Mapping[str, str]
@@ -82,7 +83,7 @@ class LocalTracker:
             feedback=scenario.fusion.feedback != "none" or scenario.initiation is not None,
             advised=scenario.fusion.feedback != "none",
             believing=scenario.joint or any(sight.sharing for sight in sights),
-            rounded=scenario.fusion.precision == "float32",
+            rounding=_rounding(scenario, scenario.sensor(name)) if scenario.fusion.precision == "float32" else None,
             selection=scenario.fusion.selection.build() if scenario.fusion.mode == "selected" else None,
             digest=scenario.digest,
             digests=scenario.digests,
@@ -123,8 +124,6 @@ class LocalTracker:
             sight.learned(seen, look, rest) if number == look.number else seen for number, seen in enumerate(state.maps)
         )
         look, unclaimed = sight.unclaimed(look, rest)
-        if self.rounded:
-            unclaimed = unclaimed.astype(np.float32).astype(np.float64)
         tracks = filtered if ready.live.all() else put_tracks(ready.advised, ready.live, filtered)
         advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
         kept = tuple(old for old in state.recent if old.time_ns >= look.time_ns - self.buffer_ns)
@@ -148,8 +147,6 @@ class LocalTracker:
             z, which = z[used], (np.cumsum(used) - 1)[plot]
         else:
             z = z[track, 0, plot]
-        if self.rounded:
-            z = z.astype(np.float32).astype(np.float64)
         return Picked(
             sensor=self.sights[look.number].config.name,
             sequence=state.sequence,
@@ -172,8 +169,6 @@ class LocalTracker:
         mixture = self.filter.report(filtered)
         there = mixture.log_w > -np.inf
         x, P = (array[0][there] for array in mixture.density)
-        if self.rounded:
-            x, P = x.astype(np.float32).astype(np.float64), P.astype(np.float32).astype(np.float64)
         pose = look.pose if self.sights[look.number].claimed is not None else SensorPose(np.empty(0))
         return Report(
             sensor=self.sights[look.number].config.name,
@@ -426,6 +421,10 @@ class LocalTracker:
 def _above(ids: IntArray, least: int) -> int:
     """The lowest id above all of ``ids``, and at least ``least``."""
     return int(ids.max(initial=least - 1)) + 1
+
+
+def _rounding(scenario: Scenario, config: SensorConfig) -> Rounding:
+    return Rounding(scenario.motion.dimensions, plots=config.kind == "position")
 
 
 def _interval(times_ns: IntArray, t_ns: int) -> Array:

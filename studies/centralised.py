@@ -73,7 +73,7 @@ class Centralised:
         fuser = replace(whole, sensors=whole.sensors[:1], share=HONEST, terms=terms, globalised=False)
         return cls(
             names=scenario.sensor_names,
-            tracker=replace(tracker, filter=local, rounded=False, selection=None, buffer_ns=0, schedule=None),
+            tracker=replace(tracker, filter=local, rounding=None, selection=None, buffer_ns=0, schedule=None),
             fuser=fuser,
             hypotheses=given(scenario, fuser),
             initiation=Initiation.of(scenario),

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from common.codec import encode
+from common.codec import as_sent, encode
 from common.config import Scenario
 from common.estimation.gaussian import Gaussian
 from common.messages import NEVER, Advice, Join, Rebase, Start
@@ -75,8 +75,8 @@ class _Network:
             tracker, node = self._trackers[look.sensor], self._nodes[look.sensor]
             scan = NodeLook(look.time_ns, look.pose, own(look.plots), look.sensor)
             self._nodes[look.sensor], report = tracker.look(node, scan, self._next_ns(look.sensor, i))
-            up += len(encode(report, rounded=tracker.rounded))
-            self._tell(report)
+            up += len(encode(report, rounding=tracker.rounding))
+            self._tell(as_sent(report, tracker.rounding))
             if i + 1 == len(looks) or looks[i + 1].time_ns > look.time_ns:
                 picture = self._state.picture
                 log_lr.append(picture.log_lr_total)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from common.codec import as_sent
 from common.config import Scenario
 from common.messages import (
     NEVER,
@@ -50,8 +51,9 @@ class Replay:
             yield from self._tell_center(Join(name, incarnation, next(times), self._center.digest))
         for scan in self._scans:
             name = scan.sensor
-            self._nodes[name], report = self._trackers[name].scan(self._nodes[name], scan, next(self._next[name]))
-            yield from self._tell_center(report)
+            tracker = self._trackers[name]
+            self._nodes[name], report = tracker.scan(self._nodes[name], scan, next(self._next[name]))
+            yield from self._tell_center(as_sent(report, tracker.rounding))
 
     @property
     def left_out(self) -> dict[str, int]:

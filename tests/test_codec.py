@@ -10,8 +10,9 @@ from builders import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.codec import LAYOUTS, ROUNDED, ROUNDED_PLOTS, VERSION, decode, encode
+from common.codec import LAYOUTS, ROUNDED, VERSION, Rounding, as_sent, decode, encode
 from common.errors import DecodeError, VersionError
+from common.estimation.gaussian import are_positive_definite
 from common.messages import (
     NEVER,
     Advice,
@@ -152,10 +153,8 @@ def picked(tracks: int, plots: int, m: int = 2) -> Picked:
     )
 
 
-def rounded(message: Any) -> Any:
-    """A report whose densities and plots fit into single precision."""
-    names = {"x", "P", "z", "unclaimed"} & set(message._fields)
-    return message._replace(**{name: getattr(message, name).astype("f4").astype("f8") for name in names})
+#: In 2-D, of a sensor whose plots are positions, and of another.
+POSITIONS, POLAR = Rounding(2, plots=True), Rounding(2, plots=False)
 
 
 MESSAGES: dict[str, Message] = {
@@ -427,15 +426,37 @@ def test_a_pose_adds_itself_to_the_bytes_and_nothing_else() -> None:
 GOLDEN_ROUNDED = [
     (
         GOLDEN_UNCLAIMED,
-        "95 03 0a 94 03 0a cf7fffffffffffffff 02 96 01 01 02 02 01 02"
-        "c4 39 07000000 01 000000000000e0bf"  # log_g in full
-        "0000803f 00000040 00008040 0000803f 00004040"  # x, P
+        POSITIONS,
+        "95 03 0a 94 03 0a cf7fffffffffffffff 02 97 01 01 02 02 01 02 02"
+        "c4 41 07000000 01 000000000000e0bf"  # log_g in full
+        "0000803e 00000040 02008040 0000803f 03004040"  # x, P
         "0000000000001440 0000000000000000"  # position in full
-        "0000003f 000000c0",  # unclaimed
+        "000080be 000000c0"  # unclaimed
+        "0000403f 00000000",  # reference
     ),
     (
         GOLDEN_PICKED,
-        "95 03 0e 94 03 0a 0c 02 96 01 01 01 02 02 01"
+        POSITIONS,
+        "95 03 0e 94 03 0a 0c 02 97 01 01 01 02 02 01 02"
+        "c4 30 07000000 0100 0000 0000803e 00000040"  # z
+        "0000000000001440 0000000000000000"  # position in full
+        "000080be 000000c0"  # unclaimed
+        "0000403f 00000000",  # reference
+    ),
+    (
+        GOLDEN_UNCLAIMED,
+        POLAR,
+        "95 03 0f 94 03 0a cf7fffffffffffffff 02 97 01 01 02 02 01 02 02"
+        "c4 41 07000000 01 000000000000e0bf"  # log_g in full
+        "00000000 00000000 02008040 0000803f 03004040"  # x, P
+        "0000000000001440 0000000000000000"  # position in full
+        "0000003f 000000c0"  # unclaimed
+        "0000803f 00000040",  # reference
+    ),
+    (
+        GOLDEN_PICKED,
+        POLAR,
+        "95 03 10 94 03 0a 0c 02 96 01 01 01 02 02 01"
         "c4 28 07000000 0100 0000 0000803f 00000040"  # z
         "0000000000001440 0000000000000000"  # position in full
         "0000003f 000000c0",  # unclaimed
@@ -443,11 +464,16 @@ GOLDEN_ROUNDED = [
 ]
 
 
-@pytest.mark.parametrize(("message", "golden"), GOLDEN_ROUNDED, ids=["report", "picked"])
-def test_the_bytes_of_a_rounded_report_never_change(message: Message, golden: str) -> None:
+@pytest.mark.parametrize(("message", "rounding", "golden"), GOLDEN_ROUNDED)
+def test_the_bytes_of_a_rounded_report_never_change(message: Message, rounding: Rounding, golden: str) -> None:
     payload = bytes.fromhex(golden)
-    assert encode(message, rounded=True) == payload
-    assert same(decode(KEYS.of(message), payload), message)
+    assert encode(message, rounding=rounding) == payload
+    got = decode(KEYS.of(message), payload)
+    if isinstance(got, Report):
+        # Five in 2^24 larger, so that it stays positive definite.
+        np.testing.assert_allclose(got.P, message.P, rtol=5 * 2.0**-24)
+        got = got._replace(P=message.P)
+    assert same(got, message)
 
 
 GOLDEN_NAMES = ["report", "unclaimed", "picked", "start", "begin", "advice", "rebase", "join", "join again", "merged"]
@@ -481,7 +507,7 @@ def test_a_message_keeps_its_budget(name: str, budget: int) -> None:
 
 
 def test_a_rounded_report_keeps_its_budget() -> None:
-    assert len(encode(report(100), rounded=True)) <= 70 * 100
+    assert len(encode(report(100), rounding=POSITIONS)) <= 70 * 100
 
 
 @pytest.mark.parametrize(
@@ -498,7 +524,7 @@ def test_a_rounded_report_keeps_its_budget() -> None:
 )
 def test_one_more_takes_so_many_bytes(less: Message, more: Message, double: int, single: int) -> None:
     assert len(encode(more)) - len(encode(less)) == double
-    assert len(encode(more, rounded=True)) - len(encode(less, rounded=True)) == single
+    assert len(encode(more, rounding=POSITIONS)) - len(encode(less, rounding=POSITIONS)) == single
 
 
 def test_small_messages_keep_their_budgets() -> None:
@@ -507,19 +533,77 @@ def test_small_messages_keep_their_budgets() -> None:
     assert len(encode(MESSAGES["decision-confirmed"])) <= 50
 
 
-REPORTS = {name: message for name, message in MESSAGES.items() if isinstance(message, Report | Picked)}
+REPORTS = {
+    name: message
+    for name, message in MESSAGES.items()
+    if isinstance(message, Report | Picked) and not name.endswith("of-1")  # a position has two numbers
+}
 
 
 @pytest.mark.parametrize("message", REPORTS.values(), ids=REPORTS.keys())
-def test_a_rounded_report_keeps_its_evidence_and_what_fits(message: Report | Picked) -> None:
-    payload = encode(message, rounded=True)
-    assert msgpack.unpackb(payload)[1] == (ROUNDED if isinstance(message, Report) else ROUNDED_PLOTS)
-    assert same(decode(KEYS.of(message), payload), rounded(message))
+@pytest.mark.parametrize("rounding", [POSITIONS, POLAR])
+@pytest.mark.parametrize("at", [0.0, 3.9e6, -1e9])
+def test_a_rounded_report_keeps_its_evidence_and_what_lies_near(
+    message: Report | Picked, rounding: Rounding, at: float
+) -> None:
+    """Numbers are of a unit's size, and positions around ``at``."""
+    message = shifted(message, rounding, at)
+    payload = encode(message, rounding=rounding)
+    assert msgpack.unpackb(payload)[1] == ROUNDED[type(message), rounding.plots]
+    got = decode(KEYS.of(message), payload)
+    for name in message._fields:
+        sent, came = getattr(message, name), getattr(got, name)
+        if name in ("x", "z", "unclaimed"):
+            np.testing.assert_allclose(came, sent, rtol=0.0, atol=1e-6)
+        elif name == "P":
+            np.testing.assert_allclose(came, sent, rtol=2.0**-20)
+        else:
+            assert np.array_equal(came, sent)
+
+
+def shifted(message: Report | Picked, rounding: Rounding, at: float) -> Report | Picked:
+    """A report whose positions are somewhere else."""
+    names = ["x", "z", "unclaimed"] if rounding.plots else ["x"]
+    arrays = {name: getattr(message, name).copy() for name in names if hasattr(message, name)}
+    for array in arrays.values():
+        array[:, : rounding.dimensions] += at
+    return message._replace(**arrays)
+
+
+def test_a_position_far_off_takes_nothing_from_the_others() -> None:
+    message = shifted(report(5), POLAR, 3.9e6)
+    message.x[2, 0] = 1e15
+    got = as_sent(message, POLAR)
+    assert isinstance(got, Report)
+    near = np.arange(5) != 2
+    assert np.abs(got.x - message.x)[near].max() < 1e-5
+
+
+@settings(deadline=None, derandomize=True, database=None)
+@given(st.integers(0, 10**6), st.floats(0.0, 15.0), st.integers(2, 9))
+def test_a_rounded_covariance_stays_positive_definite(seed: int, digits: float, n: int) -> None:
+    """However large the correlations, which rounding alone takes beyond one."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n)) * 10.0 ** -rng.uniform(0.0, digits, n)
+    P = A @ A.T + 1e-13 * np.diag(np.diag(A @ A.T))
+    message = report(1, n=n)._replace(P=P[None], x=np.zeros((1, n)))
+    got = as_sent(message, POLAR)
+    assert isinstance(got, Report)
+    assert are_positive_definite(got.P).all()
+    np.testing.assert_allclose(np.diag(got.P[0]), np.diag(P), rtol=1e-5)
+
+
+def test_a_reference_of_too_many_numbers_is_no_message() -> None:
+    envelope = msgpack.unpackb(encode(report(2), rounding=POLAR))
+    envelope[3][-1] = 5
+    envelope[4] += bytes(4 * 3)
+    with pytest.raises(DecodeError, match="a reference of 5 numbers, x has 4"):
+        decode(KEYS.report("radar-1"), msgpack.packb(envelope))
 
 
 def test_only_reports_are_rounded() -> None:
-    others = [message for name, message in MESSAGES.items() if name not in REPORTS]
-    assert all(encode(message, rounded=True) == encode(message) for message in others)
+    others = [message for message in MESSAGES.values() if not isinstance(message, Report | Picked)]
+    assert all(encode(message, rounding=POSITIONS) == encode(message) for message in others)
 
 
 UNLIKE = [

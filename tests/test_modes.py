@@ -10,7 +10,7 @@ import pytest
 from builders import hypothesis_table, scenario, sensor_table
 from reference import Density, Seer, corrected, predicted
 
-from common.codec import encode
+from common.codec import Rounding, encode
 from common.config import Scenario
 from common.messages import Advice, Decision, Message, Picked, Rebase, Report, Scan, Tracks
 from scenarios.world import simulate_all, truth
@@ -80,13 +80,15 @@ def test_a_run_is_the_replay_of_its_world(name: str) -> None:
     worlds = draw(plot, SEEDS)
     course = play(plot, name, worlds)
     assert course.log_lr.shape == (len(SEEDS), len(worlds.times_ns))
+    # Many runs in one report are rounded relative to a point near all of them.
+    rtol = 1e-5 if name.endswith("float32") else 1e-9
     for run, seed in enumerate(SEEDS):
         replayed, _ = pictures(with_fusion(plot, **fusion_of(name)), int(seed))
         assert [tracks.time_ns for tracks in replayed] == worlds.times_ns.tolist()
         for k, tracks in enumerate(replayed):
-            np.testing.assert_allclose(course.log_lr[run, k], tracks.log_lr_total[0], rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(course.x[run, k], tracks.x[0], rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(course.P[run, k], tracks.P[0], rtol=1e-8, atol=1e-8 * tracks.P[0].max())
+            np.testing.assert_allclose(course.log_lr[run, k], tracks.log_lr_total[0], rtol=rtol, atol=rtol)
+            np.testing.assert_allclose(course.x[run, k], tracks.x[0], rtol=rtol, atol=rtol)
+            np.testing.assert_allclose(course.P[run, k], tracks.P[0], rtol=10 * rtol, atol=10 * rtol * tracks.P[0].max())
 
 
 @pytest.mark.parametrize("name", ["federated-tight", "federated-mirrored-3", "selected-plots"])
@@ -132,8 +134,8 @@ def test_bytes_are_those_of_the_codec(name: str) -> None:
     _, replay = pictures(with_fusion(plot, **fusion_of(name)), int(SEEDS[0]))
     # The first scan of a is after the start of the track, so that all are looked at.
     assert len(replay.up) == len(worlds.looks)
-    rounded = fusion_of(name).get("precision") == "float32"
-    assert course.uplink_bytes == pytest.approx(np.mean([len(encode(sent, rounded=rounded)) for sent in replay.up]))
+    rounding = Rounding(2, plots=True) if fusion_of(name).get("precision") == "float32" else None
+    assert course.uplink_bytes == pytest.approx(np.mean([len(encode(sent, rounding=rounding)) for sent in replay.up]))
     assert course.downlink_bytes == pytest.approx(sum(len(encode(message)) for message in replay.down) / len(replay.up))
     assert (course.downlink_bytes > 0.0) == (fusion_of(name).get("feedback", "none") != "none")
 

@@ -11,6 +11,7 @@ from common.config import HypothesisConfig, Scenario, SensorConfig
 from common.estimation.gaussian import Array, BoolArray, Gaussian, quadratic
 from common.estimation.motion import Motion, predict
 from common.messages import Scan
+from scenarios.precision_check import precision_faults
 
 #: A standard deviation of an angle above this is hardly one in radians [rad].
 WIDEST_SIGMA = 0.5
@@ -49,7 +50,7 @@ def scenario_findings(scenario: Scenario, scans: Sequence[Scan] = ()) -> list[Fi
         scans: recorded scans, by time, if there are any: they say where sensors stood and how long they looked.
     """
     findings = [finding for sensor in scenario.sensors for finding in _of_sensor(scenario, sensor)]
-    return [*findings, *_same_hypotheses(scenario), *_unseen(scenario, scans)]
+    return [*findings, *_same_hypotheses(scenario), *_unseen(scenario, scans), *_too_coarse(scenario, scans)]
 
 
 def _of_sensor(scenario: Scenario, sensor: SensorConfig) -> Iterator[Finding]:
@@ -89,6 +90,12 @@ def _too_dense(scenario: Scenario, config: SensorConfig, where: str) -> Iterator
             "one plot, so a plot right where a target is expected is no evidence of it, and no test can decide. "
             "Expected are less than 1. Check false_plots (per scan), sigma and the size of the field of view.",
         )
+
+
+def _too_coarse(scenario: Scenario, scans: Sequence[Scan]) -> Iterator[Finding]:
+    """What reports in single precision cannot hold."""
+    for fault in precision_faults(scenario, scans):
+        yield Finding("fusion.precision", f'{fault}: evidence is lost with every scan. Set precision = "float64".')
 
 
 def _same_hypotheses(scenario: Scenario) -> Iterator[Finding]:

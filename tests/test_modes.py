@@ -88,7 +88,9 @@ def test_a_run_is_the_replay_of_its_world(name: str) -> None:
         for k, tracks in enumerate(replayed):
             np.testing.assert_allclose(course.log_lr[run, k], tracks.log_lr_total[0], rtol=rtol, atol=rtol)
             np.testing.assert_allclose(course.x[run, k], tracks.x[0], rtol=rtol, atol=rtol)
-            np.testing.assert_allclose(course.P[run, k], tracks.P[0], rtol=10 * rtol, atol=10 * rtol * tracks.P[0].max())
+            np.testing.assert_allclose(
+                course.P[run, k], tracks.P[0], rtol=10 * rtol, atol=10 * rtol * tracks.P[0].max()
+            )
 
 
 @pytest.mark.parametrize("name", ["federated-tight", "federated-mirrored-3", "selected-plots"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+import warnings
 from collections import Counter
 from contextlib import suppress
 from typing import Literal, NamedTuple, TextIO, TypeAlias, cast
@@ -31,6 +32,12 @@ def configure(log_format: LogFormat = "auto") -> None:
         logger_factory=structlog.PrintLoggerFactory(cast(TextIO, _Unfailing(sys.stderr))),
         cache_logger_on_first_use=True,
     )
+    warnings.showwarning = _log_warning
+
+
+def _log_warning(message: Warning | str, category: type[Warning], *_where: object, **_place: object) -> None:
+    """A warning of Python as a line of the log."""
+    structlog.get_logger().warning(str(message), kind=category.__name__)
 
 
 class _Unfailing:

@@ -6,9 +6,12 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from textwrap import wrap
+from warnings import catch_warnings, simplefilter
 
 from common.config import Scenario, SensorConfig
+from common.errors import PlotsWarning
 from common.messages import Scan
+from scenarios.plots import read_plots
 from scenarios.recording_check import SensorSummary, recording_findings, summarise
 from scenarios.scenario_check import Finding, scenario_findings
 from sensor_node.sources import spaced
@@ -25,6 +28,19 @@ def findings(scenario: Scenario, scans: Sequence[Scan] = ()) -> list[Finding]:
     if scans:
         found += recording_findings(scenario, spaced(scans, scenario))
     return sorted(found, key=lambda finding: not finding.spoils)
+
+
+def read_recording(path: Path, scenario: Scenario) -> tuple[list[Scan], list[Finding]]:
+    """The scans of a file of recorded plots, by time, and the lines of it that may be read wrongly.
+
+    Raises:
+        PlotsError: when the file is wrong.
+    """
+    with catch_warnings(record=True) as caught:
+        simplefilter("always", PlotsWarning)
+        scans = read_plots(path, scenario)
+    doubts = (str(warning.message).partition(": ") for warning in caught)
+    return scans, [Finding(where, text) for where, _, text in doubts]
 
 
 def recording_table(scenario: Scenario, scans: Sequence[Scan]) -> Iterator[str]:

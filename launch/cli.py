@@ -173,8 +173,7 @@ def check(
         plots: recorded plots to validate too, instead of the scenario's.
         strict: end with exit code 1 if there is a warning (notes are none).
     """
-    from launch.checks import findings, recording_table, warnings
-    from scenarios.plots import read_plots
+    from launch.checks import findings, read_recording, recording_table, warnings
     from scenarios.trajectories import read_trajectories
 
     loaded = load_scenario(find(scenario))
@@ -184,13 +183,13 @@ def check(
         f"simulated targets; {fusion.mode}, association {fusion.association}, feedback {fusion.feedback}"
     )
     recording = plots or (loaded.recording.plots if loaded.recording else None)
-    scans = read_plots(recording, loaded) if recording is not None else []
+    scans, found = read_recording(recording, loaded) if recording is not None else ([], [])
     if scans:
         print(f"{recording}: {len(scans)} scans, {sum(len(scan.z) for scan in scans)} plots")
         print("\n".join(recording_table(loaded, scans)))
     if trajectories := read_trajectories(loaded):
         print(f"recorded targets: {len(trajectories)}")
-    found = findings(loaded, scans)
+    found += findings(loaded, scans)
     for line in warnings(found):
         print(line)
     if strict and any(finding.spoils for finding in found):

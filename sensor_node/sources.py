@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from common.config import Scenario
-from common.errors import ConfigError, PlotsWarning
+from common.errors import ConfigError
 from common.messages import NEVER, Scan
 from common.quantities import NS_PER_S
 from scenarios.plots import in_order, read_plots
@@ -74,10 +73,7 @@ def source(scenario: Scenario, name: str, *, plots: Path | None = None, seed: in
         ]
         scans = spaced(simulate(scenario, name, seed_of(scenario, seed)), scenario)
         return Source(scans, _schedule(sorted(times)))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", PlotsWarning)  # the launcher has said it
-        recorded = read_plots(recording, scenario)
-    scans = spaced(recorded, scenario)
+    scans = spaced(read_plots(recording, scenario), scenario)
     return Source([scan for scan in scans if scan.sensor == name], schedule_of(scans, scenario))
 
 

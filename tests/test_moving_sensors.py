@@ -323,10 +323,25 @@ def test_the_command_line_says_it_once_and_goes_on(tmp_path: Path) -> None:
         speed = 10.0
         """
     )
-    command = [sys.executable, "-c", "from launch.cli import main; main()", "check", table, written(tmp_path, rows)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stderr == f"warning: {tmp_path / 'plots.jsonl'}{UNTOLD}\n"
-    assert "2 scans, 2 plots" in done.stdout
+    plots, start = written(tmp_path, rows), [sys.executable, "-c", "from launch.cli import main; main()"]
+    done = subprocess.run([*start, "replay", table, plots], capture_output=True, text=True, check=True)
+    assert done.stderr == f"warning: {plots}{UNTOLD}\n"
+    for strict, code in (([], 0), (["--strict"], 1)):
+        done = subprocess.run([*start, "check", table, plots, *strict], capture_output=True, text=True, check=False)
+        assert done.returncode == code
+        assert f"warning: {plots}{UNTOLD}" in done.stdout.replace("\n  ", " ")
+        assert not done.stderr
+
+
+def test_a_process_of_a_network_says_warnings_in_its_log() -> None:
+    script = "from common.logs import configure; configure('json'); import warnings; warnings.warn('that')"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert json.loads(done.stderr) | {"timestamp": ""} == {
+        "kind": "UserWarning",
+        "event": "that",
+        "level": "warning",
+        "timestamp": "",
+    }
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from common.config import Scenario, SensorConfig
 from common.errors import PlotsWarning
 from common.messages import Scan
 from scenarios.plots import read_plots
+from scenarios.pose_check import pose_findings
 from scenarios.recording_check import SensorSummary, recording_findings, summarise
 from scenarios.scenario_check import Finding, scenario_findings
 from sensor_node.sources import spaced
@@ -26,7 +27,7 @@ def findings(scenario: Scenario, scans: Sequence[Scan] = ()) -> list[Finding]:
     """Everything that does not fit in a scenario and its recorded scans, what spoils results first."""
     found = scenario_findings(scenario, scans)
     if scans:
-        found += recording_findings(scenario, spaced(scans, scenario))
+        found += [*recording_findings(scenario, spaced(scans, scenario)), *pose_findings(scenario, scans)]
     return sorted(found, key=lambda finding: not finding.spoils)
 
 

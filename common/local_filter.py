@@ -20,7 +20,7 @@ from common.estimation.association import (
 )
 from common.estimation.detection import Notch
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp
-from common.estimation.imm import Imm, Modes, predict_modes
+from common.estimation.imm import Imm, Modes, predict_modes, predict_probabilities
 from common.estimation.joint import joint
 from common.estimation.mixture import Mixture, Reduction, step, step_with, terms
 from common.estimation.motion import Motion
@@ -111,6 +111,17 @@ class LocalFilter:
         log_w = np.full((density.x.shape[1], components), -np.log(components))
         several = Gaussian(*(np.repeat(part[:, :, None], components, axis=2) for part in density))
         return Mixture(log_w, log_w if log_g is None else log_w + log_g[:, None], several)
+
+    @property
+    def models(self) -> int:
+        """How many motion models a target changes between; 0: there is one."""
+        return len(self.motion.models) if isinstance(self.motion, Imm) else 0
+
+    def predict_probabilities(self, log_mu: Array, dt: Array) -> Array:
+        """Log probabilities of the motion models after intervals [s], shapes (..., r), (...); of one model, r = 0."""
+        if not isinstance(self.motion, Imm):
+            return log_mu
+        return predict_probabilities(log_mu, self.motion.mode_transition(dt))
 
     def predict(self, prior: Mixture, *intervals: Array) -> Mixture:
         """Predict all filters of all tracks (Eq. 5), each over its interval [s], shape () or (T,)."""

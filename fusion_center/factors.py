@@ -261,6 +261,8 @@ class Fuser:
         old, _ = common(then.ids, now.ids[rows])
         assert len(then.ids[old]) == len(now.ids[rows]), "a track that was told of was there"
         log_a, (x, P) = self._shares(Gaussian(told.x[given], told.P[given]))
+        if isinstance(self.motion, Imm):  # which model is in force each factor goes on to say for itself
+            log_a = then.log_a[old]
         part = take(now, rows) if not isinstance(rows, slice) else now
         total, possible = then.log_lr_total[old], part.log_lr_total > -np.inf
         # What confirmations took from log LR since stays taken.

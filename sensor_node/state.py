@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from common.estimation.association import Expected, Plots
-from common.estimation.batch import put
+from common.estimation.batch import concatenate, put, take
 from common.estimation.clutter_map import ClutterMap
 from common.estimation.gaussian import Array, BoolArray
 from common.estimation.mixture import Mixture
@@ -28,7 +28,8 @@ class Tracks(NamedTuple):
         times_a_ns: of the association filters, shape (T,).
         x_a, P_a: association filters.
         log_odds: of existence, as far as this sensor knows, shape (T,).
-        visible: probability to be visible to each sensor of the network, as far as it tells this node, shape (T, S).
+        visible: probability to be visible to each sensor of the network, as far as it tells this node, at the time of
+            the association filter, shape (T, S).
         network_P: for ``dkf``, the covariances that all sensors' factors have by the models alone, shape
             (T, S, n, n); otherwise S = 0.
     """
@@ -78,6 +79,25 @@ class Ready(NamedTuple):
         return same_state and same_scan and self.pose.equals(pose)
 
 
+class Beliefs(NamedTuple):
+    """What a node knows of tracks beside their densities, one row a track.
+
+    Attributes:
+        ids: ascending, shape (T,).
+        times_ns, times_a_ns: of the factors and association filters, shape (T,).
+        log_odds, visible: as in ``Tracks``.
+        log_mu: log probabilities of the motion models in the factor and in the association filter, shape (T, 2, r); of
+            a single model none, r = 0.
+    """
+
+    ids: IntArray
+    times_ns: IntArray
+    times_a_ns: IntArray
+    log_odds: Array
+    visible: Array
+    log_mu: Array
+
+
 class Look(NamedTuple):
     """A scan as the tracker keeps it.
 
@@ -88,6 +108,7 @@ class Look(NamedTuple):
             tracks start together, of every track its own.
         number: of the sensor in the scenario.
         log_free: log probability of each plot to belong to none of the tracks there were; None: not told.
+        before: what was known of the tracks that have worked it in, just before; None: no feedback will ask for it.
     """
 
     time_ns: int
@@ -95,6 +116,7 @@ class Look(NamedTuple):
     plots: Plots
     number: int
     log_free: Array | None = None
+    before: Beliefs | None = None
 
 
 class State(NamedTuple):
@@ -150,6 +172,14 @@ def left(look: Look) -> Look:
     relative = look.plots.log_relative
     more = -look.log_free if relative is None else relative - look.log_free
     return look._replace(plots=look.plots._replace(log_relative=more))
+
+
+def with_before(look: Look, beliefs: Beliefs) -> Look:
+    """A scan that more tracks, or the same tracks anew, have worked in."""
+    if look.before is not None:
+        others = take(look.before, ~np.isin(look.before.ids, beliefs.ids))
+        beliefs = concatenate(others, beliefs)
+    return look._replace(before=take(beliefs, np.argsort(beliefs.ids)))
 
 
 def put_tracks(tracks: Tracks, rows: BoolArray, part: Tracks) -> Tracks:

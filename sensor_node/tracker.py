@@ -16,7 +16,7 @@ from common.codec import Rounding
 from common.config import Scenario, SensorConfig
 from common.estimation import clutter_map
 from common.estimation.association import Expected, Plots
-from common.estimation.batch import concatenate, take
+from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp
 from common.estimation.mixture import Mixture
 from common.estimation.pose import SensorPose
@@ -26,7 +26,7 @@ from common.local_filter import SUREST, LocalFilter
 from common.messages import NEVER, Advice, Begin, IntArray, Join, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
 from sensor_node.sight import Sight
-from sensor_node.state import Look, Ready, Schedule, State, Tracks, alike, left, put_tracks
+from sensor_node.state import Beliefs, Look, Ready, Schedule, State, Tracks, alike, left, put_tracks, with_before
 
 
 @dataclass(frozen=True)
@@ -127,6 +127,8 @@ class LocalTracker:
         tracks = filtered if ready.live.all() else put_tracks(ready.advised, ready.live, filtered)
         advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
         kept = tuple(old for old in state.recent if old.time_ns >= look.time_ns - self.buffer_ns)
+        if self.advised:
+            look = with_before(look, self._beliefs(take(ready.advised, ready.live)))
         if self.selection is None:
             report: Report | Picked = self._report(state, look, next_ns, filtered.ids, mixture, unclaimed)
         else:
@@ -215,7 +217,10 @@ class LocalTracker:
     def start(self, state: State, start: Start) -> State:
         """Take over tracks, and catch up on the scans since their start; a higher epoch names all tracks there are."""
         if start.epoch > state.epoch:
-            state = state._replace(epoch=start.epoch, tracks=self.initial().tracks, lineage=0, rebases=())
+            # What was known of an earlier center's tracks says nothing of these.
+            recent = tuple(look._replace(before=None) for look in state.recent)
+            tracks = self.initial().tracks
+            state = state._replace(epoch=start.epoch, tracks=tracks, recent=recent, lineage=0, rebases=())
         heard = _above(start.ids, start.next_id if start.next_id < NEVER else 0)
         state = state._replace(next_id=start.next_id, known_id=max(state.known_id, heard))
         state = self._taken_over(state, take(self._fresh(start), ~np.isin(start.ids, state.tracks.ids)))
@@ -243,7 +248,10 @@ class LocalTracker:
         return state if rebase.epoch <= state.lineage else state._replace(rebases=(*state.rebases, rebase))
 
     def _rebased(self, state: State, t_ns: int) -> State:
-        """Begin anew from the newest rebase that holds for a scan, and catch up on the scans since (theory.md §3)."""
+        """Begin anew from the newest rebase that holds for a scan, and catch up on the scans since (theory.md §3).
+
+        Only the densities begin anew: all else is what it was at that time, and sees the scans since again.
+        """
         holding = [rebase for rebase in state.rebases if rebase.after_ns < t_ns]
         if not holding:
             return state
@@ -252,21 +260,59 @@ class LocalTracker:
         times_ns, zero = np.full(len(told.ids), told.time_ns), np.zeros(len(told.ids))
         start = Start("", told.epoch, told.ids, times_ns, zero, *factor, told.x, told.P)
         fresh = take(self._fresh(start), np.isin(told.ids, mine.ids))
+        fresh = self._recalled(fresh, self._known(state, told.time_ns))
+        ended = np.isin(fresh.ids, mine.ids[mine.log_odds == -np.inf])
+        fresh = fresh._replace(log_odds=np.where(ended, -np.inf, fresh.log_odds))
         later = tuple(rebase for rebase in state.rebases if rebase.epoch > told.epoch)
         state = state._replace(tracks=take(mine, ~np.isin(mine.ids, told.ids)), lineage=told.epoch, rebases=later)
         return self._taken_over(state, fresh)
 
     def _taken_over(self, state: State, fresh: Tracks, *, alone: bool = True) -> State:
         """The state with new tracks, which have seen the scans that are kept; if not alone, what the others left."""
-        for look in state.recent if alone else map(left, state.recent):
-            due = fresh.times_ns < look.time_ns
+        recent = []
+        for kept in state.recent:
+            look, due = kept if alone else left(kept), fresh.times_ns < kept.time_ns
             if due.any():
-                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.pose, look.number)
+                part = take(fresh, due)
+                recent.append(with_before(kept, self._beliefs(part)) if self.advised else kept)
+                predicted, mixture, expected = self._expect(part, look.time_ns, look.pose, look.number)
                 mixture, visible, _ = self.sights[look.number].look(self.filter, predicted, mixture, expected, look)
                 fresh = put_tracks(fresh, due, self._with(predicted, mixture)._replace(visible=visible))
+            else:
+                recent.append(kept)
         tracks = concatenate(*alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
-        return state._replace(tracks=tracks)
+        return state._replace(tracks=tracks, recent=tuple(recent))
+
+    def _beliefs(self, tracks: Tracks) -> Beliefs:
+        """What is known of tracks beside their densities."""
+        log_mu = np.empty((len(tracks.ids), 2, 0))
+        if self.filter.models:
+            # Evidence that is impossible tells nothing of the models.
+            log_g = np.where((tracks.log_g > -np.inf).any(axis=-1, keepdims=True), tracks.log_g, 0.0)
+            log_mu = np.stack([log_g - log_sum_exp(log_g)[:, None], tracks.log_w], axis=1)
+        return Beliefs(tracks.ids, tracks.times_ns, tracks.times_a_ns, tracks.log_odds, tracks.visible, log_mu)
+
+    def _known(self, state: State, time_ns: int) -> Beliefs | None:
+        """What was known of the tracks at a time, of no later scan; None: that is not kept."""
+        later = [look for look in state.recent if look.time_ns > time_ns]
+        known = later[0].before if later else self._beliefs(state.tracks)
+        if known is None:
+            return None
+        dt, dt_a = (np.maximum(time_ns - times, 0) / NS_PER_S for times in (known.times_ns, known.times_a_ns))
+        times, visible = np.full_like(known.times_ns, time_ns), self._still_visible(known.visible, dt_a)
+        log_mu = self.filter.predict_probabilities(known.log_mu, np.stack([dt, dt_a], axis=1))
+        return known._replace(times_ns=times, times_a_ns=times, visible=visible, log_mu=log_mu)
+
+    def _recalled(self, tracks: Tracks, known: Beliefs | None) -> Tracks:
+        """Tracks whose densities begin anew, with what else was known of them at that time."""
+        if known is None or not len(known.ids):
+            return tracks
+        _, rows, others = np.intersect1d(tracks.ids, known.ids, assume_unique=True, return_indices=True)
+        part, known = take(tracks, rows), take(known, others)
+        if self.filter.models:
+            part = part._replace(log_g=known.log_mu[:, 0], log_w=known.log_mu[:, 1])
+        return put(tracks, rows, part._replace(log_odds=known.log_odds, visible=known.visible))
 
     def stop(self, state: State, stop: Stop) -> State:
         """Forget tracks."""
@@ -299,22 +345,28 @@ class LocalTracker:
         advice = sorted(past, key=lambda advice: advice.time_ns)[-1]  # of one time the one that came last
         tracks = state.tracks
         _, mine, given = np.intersect1d(tracks.ids, advice.ids, assume_unique=True, return_indices=True)
-        log_w, x_a, P_a = tracks.log_w.copy(), tracks.x_a.copy(), tracks.P_a.copy()
-        times, honest = tracks.times_a_ns.copy(), self.filter.honest
-        times[mine] = advice.time_ns
         # Of several models, the node's own opinion which one is in force stays.
-        _, _, ((x_a[mine],), (P_a[mine],)) = honest.start(Gaussian(advice.x[given], advice.P[given]))
+        told, (_, _, ((x_a,), (P_a,))) = (
+            self._recalled(take(tracks, mine), self._known(state, advice.time_ns)),
+            self.filter.honest.start(Gaussian(advice.x[given], advice.P[given])),
+        )
+        told = told._replace(times_a_ns=np.full(len(mine), advice.time_ns), x_a=x_a, P_a=P_a)
         for look in state.recent:
-            due = times < look.time_ns
-            if due.any():
-                prior = Mixture(log_w[due], log_w[due], Gaussian(x_a[due][None], P_a[due][None]))
-                predicted = honest.predict(prior, _interval(times[due], look.time_ns))
-                sight, visible = self.sights[look.number], tracks.visible[due, look.number]
-                expected = sight.expect(honest, predicted, look.pose, visible)
-                filtered = sight.filter(honest, predicted, expected, look, tracks.log_odds[due])
-                log_w[due], _, ((x_a[due],), (P_a[due],)) = filtered
-                times[due] = look.time_ns
-        return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times)
+            if look.time_ns > advice.time_ns and len(mine):
+                told = self._redone(told, look)
+        part = take(tracks, mine)
+        return put(tracks, mine, told._replace(log_g=part.log_g, log_odds=part.log_odds))
+
+    def _redone(self, tracks: Tracks, look: Look) -> Tracks:
+        """Work a scan into association filters again; existence is for the factors to say."""
+        honest, sight, dt = self.filter.honest, self.sights[look.number], _interval(tracks.times_a_ns, look.time_ns)
+        prior = Mixture(tracks.log_w, tracks.log_w, Gaussian(tracks.x_a[None], tracks.P_a[None]))
+        predicted, visible = honest.predict(prior, dt), self._still_visible(tracks.visible, dt)
+        expected = sight.expect(honest, predicted, look.pose, visible[:, look.number])
+        then = self._recalled(tracks, look.before)._replace(visible=visible)
+        (log_w, _, ((x_a,), (P_a,))), visible, _ = sight.look(honest, then, predicted, expected, look)
+        times = np.full_like(tracks.times_a_ns, look.time_ns)
+        return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times, visible=visible)
 
     def _fresh(self, start: Start) -> Tracks:
         """Tracks as they are told of."""
@@ -334,7 +386,7 @@ class LocalTracker:
             times_a_ns=start.times_ns,
             x_a=x[1],
             P_a=P[1],
-            log_odds=np.zeros(len(start.ids)),
+            log_odds=np.clip(start.log_p_bar, -SUREST, SUREST) if self.believing else np.zeros(len(start.ids)),
             visible=np.tile(visible, (len(start.ids), 1)),
             network_P=network_P,
         )
@@ -343,7 +395,7 @@ class LocalTracker:
         """Predict to a time, and what a sensor at a pose will see then."""
         mixture, network_P = self._predict(tracks, time_ns)
         now = np.full_like(tracks.times_ns, time_ns)
-        visible = self._still_visible(tracks.visible, (time_ns - tracks.times_ns) / NS_PER_S)
+        visible = self._still_visible(tracks.visible, (time_ns - tracks.times_a_ns) / NS_PER_S)
         predicted = tracks._replace(times_ns=now, times_a_ns=now, visible=visible, network_P=network_P)
         expected = self.sights[number].expect(self.filter, mixture, pose, visible[:, number])
         return self._with(predicted, mixture), mixture, expected

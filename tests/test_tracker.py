@@ -465,7 +465,7 @@ def advice_at(plot: Scenario, time_s: float, *ids: int) -> Advice:
 
 @pytest.mark.parametrize("late", [1, 2, 4])
 def test_late_advice_is_as_good_as_advice_in_time(late: int) -> None:
-    # Jointly, scans that are redone go by the existence of now, which is not that of then.
+    # Jointly, existence counts too, which goes by the evidence of the factors, and they saw worse advice.
     plot = world(fusion={"feedback": "advice", "joint": False})
     tracks = start(plot, 0.0, 0.0)
     advice = advice_at(plot, 4.0, 0, 1)

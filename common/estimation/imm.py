@@ -226,6 +226,11 @@ def mix(mu: Array, densities: Gaussian, transition: Array) -> tuple[Array, Gauss
     return np.exp(log_mu), mixed
 
 
+def predict_probabilities(log_mu: Array, transition: Array) -> Array:
+    """Log probabilities of the modes after a transition, shapes (..., r), (..., r, r) to (..., r) (Eq. 1a)."""
+    return log_sum_exp(log_mu[..., None, :] + _log(transition.mT))
+
+
 def mix_log(log_mu: Array, densities: Gaussian, transition: Array) -> tuple[Array, Gaussian]:
     """``mix`` with the logarithms of the probabilities, which then may be as small as they like."""
     # Axis -2 counts the mode that will be, -1 the mode that was.

@@ -248,7 +248,7 @@ class Clock(NamedTuple):
 
     Attributes:
         time_ns: measurement time at ``wall_ns``; in lockstep the newest one worked in.
-        wall_ns: instant of the wall clock.
+        wall_ns: instant of the wall clock: the clock's beginning or, for a node that joins later, when it is told.
         speed: seconds of measurement time per second; 0: lockstep, scans up to ``clear_ns`` may be processed.
         clear_ns: the earliest time any sensor will report next; NEVER: all sources are exhausted.
     """

@@ -133,7 +133,7 @@ class Center:
             case Join() if (refusal := self._other_network(event)) is not None:
                 state = state.refuse(event.sensor, refusal)
             case Join():
-                state, messages = self._join(state, event)
+                state, messages = self._join(state, event, now_ns)
             case Presence() if event.sensor in self.names:
                 number = self.names.index(event.sensor)
                 state = state.with_member(number, state.members[number]._replace(alive=event.alive))
@@ -192,7 +192,7 @@ class Center:
     def _window_ns(self) -> int:
         return round(self.fusion.window * NS_PER_S)
 
-    def _join(self, state: State, join: Join) -> tuple[State, list[Message]]:
+    def _join(self, state: State, join: Join, now_ns: int) -> tuple[State, list[Message]]:
         """Answer a sensor with the tracks; one whose process is new gets its own last factors back."""
         number = self.names.index(join.sensor)
         member = state.members[number]
@@ -214,7 +214,7 @@ class Center:
         if state.clock is not None:
             advice = self._advice(state) if state.history else []
             to_come = [told.rebase for told in state.told if told.rebase.epoch > state.lineage]
-            answer += [*advice, *to_come, state.clock]
+            answer += [*advice, *to_come, _present(state.clock, now_ns)]
         return state, answer
 
     def _next_epoch(self, state: State) -> int:
@@ -481,6 +481,13 @@ class Center:
     def tracks(self, state: State) -> Tracks:
         """The newest picture as a message: all tracks that have started."""
         return shown(state.picture, state.time_ns, self.names)
+
+
+def _present(clock: Clock, now_ns: int) -> Clock:
+    """The same clock, told from now on: a node that joins learns the present without a look at its own clock."""
+    if clock.speed == 0.0 or now_ns <= clock.wall_ns:
+        return clock
+    return clock._replace(time_ns=clock.present_ns(now_ns), wall_ns=now_ns)
 
 
 def given(scenario: Scenario, fuser: AnyFuser) -> Picture:

@@ -27,8 +27,8 @@ _JOIN_EVERY_NS = 1_000_000_000
 #: So long before a scan the work ahead of it is done: not while a center on the same machine is busy, and late enough
 #: that its results are still in the caches.
 _AHEAD_NS = 10_000_000
-#: A clock that begins later than that from now is another host's idea of the time.
-_EARLY_S = 1.0
+#: By so much this host's clock may seem to be off before that is worth a word.
+_CLOCK_TOLERANCE_S = 1.0
 #: With all scans sent, how long a center that is gone may take to come back for the last reports.
 _FAREWELL_NS = 5_000_000_000
 
@@ -70,7 +70,8 @@ class NodeShell:
         self._center = self._new_center = False
         self._answered = self._stopped = False
         self._epoch: int | None = None
-        self._began_ns = self._joined_ns = self._ask_ns = 0
+        self._began_ns = self._ask_ns = 0
+        self._clock_offset_s: float | None = None
         self._gone_ns: int | None = None
         self._reported_s: float | None = None
         self._keys = Keys(network.name)
@@ -145,6 +146,7 @@ class NodeShell:
             "sensor": self._name,
             "linked": self._center,
             "last_report_s": age_s(self._reported_s),
+            "clock_offset_s": None if self._clock_offset_s is None else round(self._clock_offset_s, 3),
             "scans": self._position,
             "of": len(self._scans),
             "tracks": len(self._state.tracks.ids),
@@ -179,9 +181,6 @@ class NodeShell:
             self._join()
 
     def _join(self) -> None:
-        # The first time counts: over a slow link a node asks again before it can have been answered.
-        if self._clock is None and not self._joined_ns:
-            self._joined_ns = now_ns()
         self._publish(self._tracker.join(self._state, self._incarnation, self._next_ns()))
 
     def _next_ns(self) -> int:
@@ -245,24 +244,29 @@ class NodeShell:
     def _set_clock(self, clock: Clock) -> None:
         first, clock = self._clock is None, clock._replace(wall_ns=clock.wall_ns - set_by_ns())
         self._clock = clock
+        if clock.speed > 0.0 and (first or self._new_center):
+            self._compare(clock)
         if self._tracker.feedback and self._new_center:
             self._advised_ns = clock.time_ns
         self._new_center = False
         if not first:
             return
-        present_ns = clock.clear_ns
-        if clock.speed > 0.0:
-            # The clock is told when it begins or later, and at most a moment before.
-            if (early_s := (clock.wall_ns - now_ns()) / 1e9) > _EARLY_S:
-                self._log.warning("clock", why=f"the clock of this host is {early_s:.1f} s behind the center's")
-            # Whoever asked before the clock began sees everything; whoever comes later begins with the present.
-            late = not 0 < self._joined_ns <= clock.wall_ns
-            present_ns = clock.present_ns(now_ns() if late else clock.wall_ns)
+        # Whoever asked before the clock began sees everything; whoever comes later is told the present.
+        present_ns = clock.time_ns if clock.speed > 0.0 else clock.clear_ns
         while self._position < len(self._scans) and self._scans[self._position].time_ns < present_ns:
             self._position += 1
         if self._position:
             self._log.warning("joined late", skipped_scans=self._position)
             self._join()
+
+    def _compare(self, clock: Clock) -> None:
+        """Compare this host's clock with the center's: what it tells a node that joins is its own time of then."""
+        self._clock_offset_s = (now_ns() - clock.wall_ns) / 1e9
+        by = f"{abs(self._clock_offset_s):.1f} s"
+        if self._clock_offset_s < -_CLOCK_TOLERANCE_S:
+            self._log.warning("clock", why=f"the clock of this host is {by} behind the center's")
+        elif self._clock_offset_s > _CLOCK_TOLERANCE_S:
+            self._log.warning("clock", why=f"the clock of this host is {by} ahead of the center's, or its link is slow")
 
     def _due_ns(self) -> int | None:
         """Wall time at which the next scan may be processed; None: not known yet."""

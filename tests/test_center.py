@@ -133,6 +133,20 @@ def test_who_joins_late_is_told_of_tracks_and_clock() -> None:
     assert start.x.tolist() == [[0.0, 0.0, 150.0, 0.0]]
 
 
+def test_who_joins_late_is_told_the_present() -> None:
+    """So that a node whose clock is wrong sees all that is still to come."""
+    stage = Stage(scenario(), wait_s=10.0, speed=2.0)
+    stage.join("a", 2.0)
+    (first,) = only(Clock, stage.tick(10.0))
+    (late,) = only(Clock, stage.join("b", 9.0, at_s=14.05))
+    assert late.wall_ns == round(14.05 * NS_PER_S)
+    assert late.time_ns == stage.ns(10.0)
+    assert late.due_ns(stage.ns(20.0)) == first.due_ns(stage.ns(20.0))
+    assert stage.state.clock == first
+    (again,) = only(Clock, stage.join("b", 9.0, at_s=10.0))
+    assert again == first
+
+
 def test_an_unknown_sensor_gets_no_answer() -> None:
     stage = Stage(scenario())
     assert stage.tell(Join("c", 1, stage.ns(2.0), stage.center.digest)) == []

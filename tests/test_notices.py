@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -15,6 +16,7 @@ import pytest
 from builders import scenario, sensor_table
 from process_helpers import ANY_PORT, PATIENCE_S, Processes, free_endpoint, log_entries, start_center, variant
 from rich.console import Console
+from structlog.testing import capture_logs
 
 from common import health, notice
 from common.clock import now_ns
@@ -24,7 +26,7 @@ from common.errors import ConfigError
 from common.health import Health
 from common.inbox import Heard, Inbox
 from common.memory import MemoryNetwork
-from common.messages import NEVER, Clock, Join, Keys, Report, Start
+from common.messages import NEVER, Clock, Join, Keys, Report, Scan, Start
 from common.notice import Notice
 from common.quantities import NS_PER_S
 from common.transport import Bus, open_zenoh
@@ -34,6 +36,7 @@ from launch.run import Order, Run
 from scenarios.catalogue import find
 from sensor_node.shell import NodeShell
 from sensor_node.tracker import LocalTracker
+from studies.run_folder import RunFolder
 
 
 class Sensor:
@@ -165,6 +168,37 @@ def test_the_sensor_whose_clock_is_wrong_is_told_of(offset_s: float) -> None:
     assert found["b"] == pytest.approx(0.0, abs=0.5)
 
 
+@pytest.mark.parametrize("offset_s", [60.0, -60.0, 0.0])
+def test_a_node_notices_that_its_clock_is_not_the_centers_and_skips_nothing(offset_s: float) -> None:
+    plot, memory, inbox = scenario(hypothesis=[], target=[]), MemoryNetwork(), Inbox()
+    keys, joined, answers = Keys(plot.network.name), SimpleQueue[bytes](), SimpleQueue[Health]()
+    scans = [Scan("a", plot.to_ns(time_s), np.zeros(2), np.empty((0, 2))) for time_s in (2.0, 1000.0)]
+    with memory.bus() as center, memory.bus() as bus, ThreadPoolExecutor(1) as pool, capture_logs() as logs:
+        reports: SimpleQueue[Any] = SimpleQueue()
+        center.subscribe(keys.join("a"), lambda _, payload: joined.put(payload))
+        center.subscribe(keys.report("a"), lambda key, payload: reports.put(decode(key, payload)))
+        command, clocks = center.publisher(keys.command("a")), center.publisher(keys.clock())
+        center.announce(keys.center_alive())
+        shell = NodeShell(bus, plot.network, LocalTracker.of(plot, "a"), scans, inbox=inbox, patience_s=PATIENCE_S)
+        ended = pool.submit(shell.run)
+        joined.get(timeout=PATIENCE_S)
+        ids, x, P = np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 4, 4))
+        command.put(encode(Start("a", 1, ids, ids, np.empty(0), x, P, x, P)))
+        clocks.put(encode(Clock(plot.to_ns(2.0), now_ns() - round(offset_s * NS_PER_S), 1.0, plot.to_ns(2.0))))
+        inbox.asked(answers.put)
+        found = answers.get(timeout=PATIENCE_S)
+        if offset_s >= 0.0:
+            assert reports.get(timeout=PATIENCE_S).time_ns == plot.to_ns(2.0)
+        inbox.stop()
+        ended.result(PATIENCE_S)
+    assert found["clock_offset_s"] == pytest.approx(offset_s, abs=1.0)
+    named = [entry["why"].split(",")[0] for entry in logs if entry["event"] == "clock"]
+    side = {60.0: ["ahead of"], -60.0: ["behind"], 0.0: []}[offset_s]
+    assert [re.sub(r"\d+\.\d", "#", why) for why in named] == [
+        f"the clock of this host is # s {which} the center's" for which in side
+    ]
+
+
 def test_a_node_with_another_scenario_is_told_in_what_it_differs() -> None:
     plot, other = scenario(), scenario(sensor_table("a", p_d=0.7), sensor_table("b"), motion={"psd": 1.0})
     with running(plot) as network, network.memory.bus() as bus:
@@ -196,9 +230,12 @@ def test_a_namesake_with_another_scenario_ends_no_node() -> None:
 
 def test_a_run_shows_what_the_center_tells(tmp_path: Path) -> None:
     plot, console = scenario(), Console(record=True, width=200)
-    run = Run(Order(plot, tmp_path / "test.toml", None, 1, 0.0, tmp_path, []), console)
+    order = Order(plot, tmp_path / "test.toml", None, 1, 0.0, tmp_path, [])
+    folder = RunFolder(tmp_path, plot)
+    run = Run(order, folder, console, Inbox())
     told = notice.encode(Notice("silent", "a", "a is there, but silent"))
     run._work_off(Heard(Keys(plot.network.name).notice(), told))
+    folder.finish({})
     assert "a is there, but silent" in console.export_text()
 
 

@@ -93,7 +93,9 @@ class NetworkOptions:
 
 @contextmanager
 def stopped_by_signals(stop: Callable[[], None], *, with_parent: bool = False) -> Iterator[None]:
-    """Call ``stop`` on SIGTERM and SIGINT, and with ``with_parent`` when standard input closes.
+    """Call ``stop`` on SIGTERM, SIGINT and SIGHUP, and with ``with_parent`` when standard input closes.
+
+    SIGHUP, which comes when a terminal is closed, is left alone where it is ignored, as nohup wants it.
 
     A launcher keeps the other end of its children's standard input open: however it dies, they end too.
     """
@@ -101,7 +103,9 @@ def stopped_by_signals(stop: Callable[[], None], *, with_parent: bool = False) -
     def on_signal(*_: object) -> None:
         stop()
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGTERM, signal.SIGINT)}
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    numbers = (signal.SIGTERM, signal.SIGINT, *(() if ignored else (signal.SIGHUP,)))
+    before = {number: signal.signal(number, on_signal) for number in numbers}
     if with_parent:
         threading.Thread(target=_until_closed, args=(stop,), daemon=True).start()
     try:

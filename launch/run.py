@@ -249,12 +249,10 @@ def execute(order: Order, console: Console) -> None:
 
 def _tell(folder: RunFolder, report: Report, console: Console) -> None:
     """Say how a run ended and what is left of it."""
-    for what, numbers in (
-        ("scans not shown because a link was full", folder.plots_shed),
-        ("messages left out", folder.refused),
-    ):
-        if numbers:
-            told = ", ".join(f"{number} of {name}" for name, number in sorted(numbers.items()))
-            console.print(f"{what}: {told}", soft_wrap=True)
+    if folder.plots_shed:
+        shed = ", ".join(f"{number} of {sensor}" for sensor, number in sorted(folder.plots_shed.items()))
+        console.print(f"scans not shown because a link was full: {shed}", soft_wrap=True)
+    for reason, number in sorted(folder.refused.items()):
+        console.print(f"messages left out: {number} ({reason})", soft_wrap=True)
     outcome = ", ".join(f"{folder.sketch.outcome[status]} {status.name.lower()}" for status in Status)
     console.print(f"tracks: {outcome}\nreport: {', '.join(map(str, report.files))}", soft_wrap=True)

@@ -25,8 +25,8 @@ _STYLE = {Status.TENTATIVE: "yellow", Status.CONFIRMED: "bold green", Status.DEL
 _RANK = {Status.CONFIRMED: 0, Status.TENTATIVE: 2, Status.DELETED: 3}
 #: Half the width of the bar between log A and log B, at most and at least.
 _BAR, _SHORT_BAR = 24, 8
-#: Columns of the table beside the bar, and what stands between columns.
-_GAPS = 2 * 5
+#: Characters between the five columns of the table.
+_GAPS = 4 * 3
 #: Tracks shown at most, and lines that are not of tracks.
 _ROWS, _OTHER_LINES = 30, 8
 #: How long a track that has ended is still shown [ns of measurement time].
@@ -120,7 +120,12 @@ class LiveStatus:
         taken = sum(max(map(len, column)) for column in zip(heads, *cells, strict=True)) + _GAPS
         half = max(_SHORT_BAR, min(_BAR, (self._console.width - taken - 1) // 2))
         table = Table(
-            title=self._scenario.name, title_justify="left", expand=False, box=box.SIMPLE_HEAD, pad_edge=False
+            title=self._scenario.name,
+            title_justify="left",
+            expand=False,
+            box=box.SIMPLE_HEAD,
+            pad_edge=False,
+            show_edge=False,
         )
         for head in heads[:3]:
             table.add_column(head, justify="left" if head == "status" else "right", no_wrap=True)

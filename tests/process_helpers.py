@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import select
+import shlex
 import signal
 import socket
 import subprocess
@@ -137,6 +138,11 @@ class Processes:
         """Start a command."""
         self._started.append(Process(list(command), self._family, self.cwd))
         return self._started[-1]
+
+    @staticmethod
+    def command(*arguments: object) -> str:
+        """The same as ``waldnet`` starts, for a shell."""
+        return shlex.join([WALDNET, *map(str, arguments)])
 
     def output(self, *arguments: object) -> list[str]:
         """What ``waldnet`` with arguments prints."""

@@ -175,7 +175,7 @@ def test_a_run_gets_a_table_a_figure_and_json(tmp_path: Path, capsys: pytest.Cap
 def test_several_runs_are_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = write(tmp_path / "first" / "tracks.jsonl", *straight()).parent
     second = write(tmp_path / "second.jsonl", *straight(3), *straight(status="tentative")[3:])
-    known = write(tmp_path / "truth.jsonl", *points(), *points(target=2, position=[9e9, 0.0]))
+    known = write(tmp_path / "truth.jsonl", *points(), *points(target=2, position=[9e8, 0.0]))
     command("evaluate", first, second, "--truth", known, "--json")
     told = json.loads(capsys.readouterr().out)
     assert [entry["run"] for entry in told["runs"]] == ["first", "second"]

@@ -67,7 +67,7 @@ def _row(summary: SensorSummary, config: SensorConfig) -> tuple[str, ...]:
     )
 
 
-def warnings(found: Sequence[Finding]) -> Iterator[str]:
+def describe(found: Sequence[Finding]) -> Iterator[str]:
     """Lines that say what does not fit."""
     for finding in found:
         kind = "warning" if finding.spoils else "note"
@@ -84,7 +84,7 @@ def warn(scenario: Scenario, scans: Sequence[Scan], recording: Path | None) -> N
     """
     found = [finding for finding in findings(scenario, scans if recording else ()) if finding.spoils]
     worst = list({finding.text: finding for finding in found}.values())[:_WORST]
-    for line in warnings(worst):
+    for line in describe(worst):
         sys.stderr.write(line + "\n")
     if found:
         others = f"{len(found) - len(worst)} more: " if len(found) > len(worst) else ""

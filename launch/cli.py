@@ -173,7 +173,7 @@ def check(
         plots: recorded plots to validate too, instead of the scenario's.
         strict: end with exit code 1 if there is a warning (notes are none).
     """
-    from launch.checks import findings, read_recording, recording_table, warnings
+    from launch.checks import describe, findings, read_recording, recording_table
     from scenarios.trajectories import read_trajectories
 
     loaded = load_scenario(find(scenario))
@@ -190,7 +190,7 @@ def check(
     if trajectories := read_trajectories(loaded):
         print(f"recorded targets: {len(trajectories)}")
     found += findings(loaded, scans)
-    for line in warnings(found):
+    for line in describe(found):
         print(line)
     if strict and any(finding.spoils for finding in found):
         sys.exit(1)

@@ -90,13 +90,6 @@ class _Recorded(NamedTuple):
         return float(self.sensor.field_of_view.volume ** (1.0 / self.dimensions))
 
 
-class _Reading(NamedTuple):
-    """Another way to read plots, which would explain what does not fit."""
-
-    meaning: str
-    read: Callable[[Array, Array], Array]
-
-
 def summarise(scenario: Scenario, scans: Sequence[Scan]) -> list[SensorSummary]:
     """What a recording has of each sensor of a scenario, in the order of the scenario.
 
@@ -154,7 +147,7 @@ def _summary(one: _Recorded) -> SensorSummary:
     counts, nan = np.array([len(scan.z) for scan in one.scans]), float("nan")
     if not one.scans:
         return SensorSummary(one.config.name, 0, 0, *[nan] * 7)
-    outside, repeats, full = _outside(one), _repeated(one), int((counts > 0).sum())
+    outside, repeats, full = _outside(one, _Plots.of(one).sample), _repeated(one), int((counts > 0).sum())
     return SensorSummary(
         name=one.config.name,
         scans=len(one.scans),
@@ -363,97 +356,158 @@ def _copies(recorded: Sequence[_Recorded]) -> Iterator[Finding]:
 # Places ---------------------------------------------------------------------------------------------------------------
 
 
-def _sampled(one: _Recorded) -> tuple[Array, Array]:
-    """Some plots, spread over the recording, and where the sensor stood, shapes (M, m), (M, d)."""
-    counts = np.array([len(scan.z) for scan in one.scans])
-    z = np.concatenate([scan.z for scan in one.scans])
-    stands = np.repeat(np.array([scan.position for scan in one.scans]), counts, axis=0)
-    chosen = np.unique(np.linspace(0, len(z) - 1, min(_SAMPLE, len(z))).astype(int))
-    return z[chosen], stands[chosen]
+class _Plots(NamedTuple):
+    """Plots of one sensor, those of all scans one after the other.
+
+    Attributes:
+        z: shape (M, m).
+        stands: where the sensor stood [m], shape (M, d).
+        headings: of its platform [rad], shape (M,).
+        times_s: shape (M,).
+    """
+
+    z: Array
+    stands: Array
+    headings: Array
+    times_s: Array
+
+    @classmethod
+    def of(cls, one: _Recorded) -> _Plots:
+        """All plots of a sensor."""
+        counts = np.array([len(scan.z) for scan in one.scans])
+        return cls(
+            np.concatenate([scan.z for scan in one.scans]),
+            np.repeat(np.array([scan.position for scan in one.scans]), counts, axis=0),
+            np.repeat(np.array([scan.heading for scan in one.scans]), counts),
+            np.repeat(one.times_s, counts),
+        )
+
+    def rows(self, chosen: Array | slice) -> _Plots:
+        """Some of the plots."""
+        return _Plots(*(column[chosen] for column in self))
+
+    @property
+    def sample(self) -> _Plots:
+        """Some plots, spread over the recording."""
+        return self.rows(np.unique(np.linspace(0, len(self.z) - 1, min(_SAMPLE, len(self.z))).astype(int)))
 
 
-def _outside(one: _Recorded) -> BoolArray:
-    """Which of some plots lie outside the field of view, their noise considered, shape (M,)."""
-    return _outside_view(one, *_sampled(one))
-
-
-def _outside_view(one: _Recorded, z: Array, stands: Array) -> BoolArray:
-    centers = _centers(one, stands)
-    if not len(z):
+def _outside(one: _Recorded, plots: _Plots) -> BoolArray:
+    """Which plots lie outside the field of view, their noise considered, shape (M,)."""
+    if not len(plots.z):
         return np.zeros(0, np.bool_)
     if not one.tells_place:
-        return _outside_directions(one, z)
-    view, places = one.sensor.field_of_view, _located(one, z, stands)
-    outside = np.array(~view.contains(places, centers))
+        return _outside_directions(one, plots)
+    view, offsets, origin = one.sensor.field_of_view, _offsets(one, plots), np.zeros(one.dimensions)
+    turns = _turns(one, plots)
+    outside = np.array(~view.contains(np.matvec(turns, offsets), origin))
     for k in np.flatnonzero(outside).tolist():
-        density = _density(one, z[k : k + 1], stands[k])
-        outside[k] = view.probability_inside(density, centers[k])[0] < _OUTSIDE
+        P = turns[k] @ _covariance(one, plots, k) @ turns[k].T
+        density = Gaussian((turns[k] @ offsets[k])[None], P[None])
+        outside[k] = view.probability_inside(density, origin)[0] < _OUTSIDE
     return outside
 
 
-def _outside_directions(one: _Recorded, z: Array) -> BoolArray:
+def _outside_directions(one: _Recorded, plots: _Plots) -> BoolArray:
     view = one.sensor.field_of_view
     if not isinstance(view, Sector):
-        return np.zeros(len(z), np.bool_)
+        return np.zeros(len(plots.z), np.bool_)
     near, origin = view._replace(radius=2.0, inner=0.0), np.zeros(one.dimensions)
-    margins = 3.0 * np.array([[a, b] for a in (-1, 0, 1) for b in (-1, 0, 1)])[:, : z.shape[1]] * one.config.sigma
-    around = one.sensor.measurement.locate(z[:, None] + margins, origin)
+    z = plots.z.copy()
+    z[:, 0] -= plots.headings
+    corners = np.array([[a, b] for a in (-3, 0, 3) for b in (-3, 0, 3)])[:, : z.shape[1]]
+    around = one.sensor.measurement.locate(z[:, None] + corners * np.array(one.config.sigma), origin)
     return np.array(~near.contains(around, origin).any(axis=1))
 
 
-def _centers(one: _Recorded, stands: Array) -> Array:
-    """Centers of the field of view, shape (M, d)."""
-    return np.array([one.config.view_center(stand) for stand in stands]).reshape(-1, one.dimensions)
+def _offsets(one: _Recorded, plots: _Plots) -> Array:
+    """Places of plots from the center of the field of view [m], shape (M, d)."""
+    centers = np.array([one.config.view_center(stand) for stand in plots.stands]).reshape(-1, one.dimensions)
+    return _located(one, plots) - centers
 
 
-def _located(one: _Recorded, z: Array, stands: Array) -> Array:
-    """The places of plots, shape (M, d)."""
-    origin = np.zeros(one.dimensions)
-    return z if one.config.kind == "position" else stands + one.sensor.measurement.locate(z, origin)
+def _turns(one: _Recorded, plots: _Plots) -> Array:
+    """Rotations of (east, north(, up)) into the frame of a field of view that turns with its platform, (M, d, d)."""
+    turns = np.zeros((len(plots.z), one.dimensions, one.dimensions))
+    turns[:] = np.eye(one.dimensions)
+    if not one.sensor.fixed_view:
+        sine, cosine = np.sin(plots.headings), np.cos(plots.headings)
+        turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0], turns[:, 1, 1] = cosine, -sine, sine, cosine
+    return turns
 
 
-def _density(one: _Recorded, z: Array, stand: Array) -> Gaussian:
-    """Positions that plots tell of, shapes (M, d), (M, d, d)."""
+def _located(one: _Recorded, plots: _Plots) -> Array:
+    """The places of plots [m], shape (M, d)."""
+    if one.config.kind == "position":
+        return plots.z
+    return plots.stands + one.sensor.measurement.locate(plots.z, np.zeros(one.dimensions))
+
+
+def _covariance(one: _Recorded, plots: _Plots, k: int) -> Array:
+    """Covariance of the place that a plot tells of [m^2], shape (d, d)."""
     d = one.dimensions
-    density = from_plots(z, one.sensor.measurement, stand, np.ones(one.n - d))
-    return Gaussian(density.x[:, :d], density.P[:, :d, :d])
+    density = from_plots(plots.z[k : k + 1], one.sensor.measurement, plots.stands[k], np.ones(one.n - d))
+    covariance: Array = density.P[0, :d, :d]
+    return covariance
+
+
+class _Reading(NamedTuple):
+    """Another way to read plots, which would explain what does not fit."""
+
+    meaning: str
+    read: Callable[[_Plots], Array]
+
+    def of(self, plots: _Plots) -> _Plots:
+        """The plots, read so."""
+        return plots._replace(z=self.read(plots))
+
+
+_AS_IT_IS = _Reading("as it is", lambda plots: plots.z)
 
 
 def _readings(one: _Recorded) -> list[_Reading]:
     """Other ways to read a sensor's plots."""
-    kind = one.config.kind
-
-    def with_first(first: Callable[[Array], Array], column: int) -> Callable[[Array, Array], Array]:
-        def read(z: Array, stands: Array) -> Array:  # noqa: ARG001 (readings that need the stand have it)
-            z = z.copy()
-            z[:, column] = first(z[:, column])
-            return z
-
-        return read
-
-    if kind == "position":
+    if one.config.kind == "position":
         order = [1, 0, 2][: one.dimensions]
         return [
-            _Reading("north before east", lambda z, _: z[:, order]),
-            _Reading("kilometres", lambda z, _: 1000.0 * z),
-            _Reading("metres from the sensor instead of the origin", lambda z, stands: z + stands),
+            _Reading("north before east", lambda plots: plots.z[:, order]),
+            _Reading("kilometres", lambda plots: 1000.0 * plots.z),
+            _Reading("metres from the sensor instead of the origin", lambda plots: plots.z + plots.stands),
         ]
-    azimuth = 0 if kind == "bearing" else 1
-    turned = [
-        _Reading("azimuths counted counterclockwise from east", with_first(lambda a: 0.5 * np.pi - a, azimuth)),
-        _Reading("azimuths counted counterclockwise from north", with_first(np.negative, azimuth)),
+    column = one.config.numbers.index("azimuth")
+    from_heading = one.config.azimuth == "heading"
+    found = [
+        _Reading("azimuths counted counterclockwise from east", _with(column, lambda p: 0.5 * np.pi - p.z[:, column])),
+        _Reading("azimuths counted counterclockwise from north", _with(column, lambda p: -p.z[:, column])),
     ]
-    return turned if kind == "bearing" else [*turned, _Reading("kilometres", with_first(lambda r: 1000.0 * r, 0))]
+    if any(scan.heading for scan in one.scans):
+        sign, meaning = (-1.0, "north") if from_heading else (1.0, "the heading of the platform")
+        turned = _with(column, lambda p: p.z[:, column] + sign * p.headings)
+        found.append(_Reading(f"azimuths counted from {meaning}", turned))
+    if one.tells_place:
+        found.append(_Reading("kilometres", _with(0, lambda plots: 1000.0 * plots.z[:, 0])))
+    return found
+
+
+def _with(column: int, read: Callable[[_Plots], Array]) -> Callable[[_Plots], Array]:
+    """Plots with one of their numbers read in another way."""
+
+    def changed(plots: _Plots) -> Array:
+        z = plots.z.copy()
+        z[:, column] = read(plots)
+        return z
+
+    return changed
 
 
 def _places(one: _Recorded) -> Iterator[Finding]:
-    z, stands = _sampled(one)
-    outside = _outside_view(one, z, stands)
+    plots = _Plots.of(one).sample
+    outside = _outside(one, plots)
     if outside.sum() >= 5 and outside.mean() > 0.02:
         better = [
             reading.meaning
             for reading in _readings(one)
-            if _outside_view(one, reading.read(z, stands), stands).mean() < 0.1 * outside.mean()
+            if _outside(one, reading.of(plots)).mean() < 0.1 * outside.mean()
         ]
         what = f"Read as {' or '.join(better)} they would lie inside." if better else "Check its size and position."
         yield Finding(
@@ -462,8 +516,8 @@ def _places(one: _Recorded) -> Iterator[Finding]:
             f"none. They are no evidence for tracks there, and pass for false plots. {what}",
             spoils=bool(outside.mean() > 0.2),
         )
-    if one.tells_place and len(z) >= 20 and np.isfinite(one.extent):
-        away = np.linalg.vector_norm(_located(one, z, stands) - _centers(one, stands), axis=-1)
+    if one.tells_place and len(plots.z) >= 20 and np.isfinite(one.extent):
+        away = np.linalg.vector_norm(_offsets(one, plots), axis=-1)
         if np.quantile(away, 0.9) < 0.01 * one.extent:
             other = "" if one.config.kind == "position" else ", or does the azimuth come before the range"
             yield Finding(
@@ -478,9 +532,9 @@ def _against_hypotheses(scenario: Scenario, recorded: Sequence[_Recorded]) -> It
     if not scenario.hypotheses:
         return
     for one in recorded:
-        evidence = _evidence(scenario, one, lambda z, _: z)
+        evidence = _evidence(scenario, one, _AS_IT_IS)
         for reading in _readings(one):
-            other = _evidence(scenario, one, reading.read)
+            other = _evidence(scenario, one, reading)
             if other > 3.0 * evidence + 20.0:
                 yield Finding(
                     one.where,
@@ -490,40 +544,39 @@ def _against_hypotheses(scenario: Scenario, recorded: Sequence[_Recorded]) -> It
                 )
 
 
-def _evidence(scenario: Scenario, one: _Recorded, read: Callable[[Array, Array], Array]) -> float:
+def _evidence(scenario: Scenario, one: _Recorded, reading: _Reading) -> float:
     """Sum over hypotheses of the log LR of the first scans after their start, where it is positive."""
-    total, sensor = np.zeros(len(scenario.hypotheses)), one.sensor
+    total = np.zeros(len(scenario.hypotheses))
     starts = np.array([hypothesis.start for hypothesis in scenario.hypotheses])
-    ranks = np.zeros(len(starts), np.int64)
+    used = np.zeros(len(starts), np.int64)
     for time_s, scan in zip(one.times_s, one.scans, strict=True):
-        rows = np.flatnonzero((starts <= time_s) & (ranks < _FIRST_SCANS))
-        if not len(rows):
-            if (ranks >= _FIRST_SCANS).all():
-                break
-            continue
-        ranks[rows] += 1
-        at = hypotheses_at(scenario, np.full(len(starts), time_s))
-        density = Gaussian(at.x[rows], at.P[rows])
-        view = sensor.view(one.config.view_center(scan.position))
-        p_d = sensor.detection_probability(density, scan.position)
-        p_d = p_d if view is None else p_d * view.probability_inside(density)
-        z = read(scan.z, np.broadcast_to(scan.position, (len(scan.z), one.dimensions)))
-        total[rows] += np.log(np.maximum(1.0 - p_d + p_d * _ratio(sensor, density, z, scan.position), 1e-9))
+        rows = np.flatnonzero((starts <= time_s) & (used < _FIRST_SCANS))
+        if len(rows):
+            used[rows] += 1
+            at = hypotheses_at(scenario, np.full(len(starts), time_s))
+            plots = _Plots.of(one._replace(times_s=np.array([time_s]), scans=(scan,)))
+            total[rows] += _log_lr(one, scan, Gaussian(at.x[rows], at.P[rows]), reading.of(plots).z)
+        elif (used >= _FIRST_SCANS).all():
+            break
     return float(np.maximum(total, 0.0).sum())
 
 
-def _ratio(sensor: Sensor, density: Gaussian, z: Array, stand: Array) -> Array:
-    """Sum over plots of their densities as a target's and as false ones, shape (K,)."""
+def _log_lr(one: _Recorded, scan: Scan, density: Gaussian, z: Array) -> Array:
+    """Of one scan, for predicted hypotheses, all plots of it considered for each, shape (K,)."""
+    sensor, stand = one.sensor.at(scan.pose), scan.position
+    view = sensor.view(one.config.view_center(stand))
+    p_d = sensor.detection_probability(density, stand)
+    p_d = p_d if view is None else p_d * view.probability_inside(density)
     if not len(z):
-        return np.zeros(len(density.x))
+        return np.log(np.maximum(1.0 - p_d, 1e-9))
     seen = sensor.measurement.linearise(density, stand)
     S = seen.H @ times_transposed(density.P, seen.H) + seen.R
     nu = innovations(z[None], seen.z[:, None], seen.angular)
     relative = sensor.log_relative(z, stand)
     log_f = sensor.log_rho_f + (0.0 if relative is None else relative)
     log_ratio = log_pdf(nu, Gaussian(np.zeros_like(nu), S[:, None])) - log_f
-    ratio: Array = np.exp(np.minimum(log_ratio, 50.0)).sum(axis=-1)
-    return ratio
+    ratio = 1.0 - p_d + p_d * np.exp(np.minimum(log_ratio, 50.0)).sum(axis=-1)
+    return np.asarray(np.log(np.maximum(ratio, 1e-9)))
 
 
 def _between_sensors(scenario: Scenario, recorded: Sequence[_Recorded]) -> Iterator[Finding]:
@@ -534,9 +587,9 @@ def _between_sensors(scenario: Scenario, recorded: Sequence[_Recorded]) -> Itera
         return
     for one in placed:
         others = [other for other in placed if other is not one][:_OTHERS]
-        meets = _meetings(one, others, lambda z, _: z, speed)
+        meets = _meetings(one, others, _AS_IT_IS, speed)
         for reading in _readings(one):
-            better = _meetings(one, others, reading.read, speed)
+            better = _meetings(one, others, reading, speed)
             if better >= 20 and better > 3.0 * meets and _stays_inside(one, reading):
                 yield Finding(
                     one.where,
@@ -548,35 +601,25 @@ def _between_sensors(scenario: Scenario, recorded: Sequence[_Recorded]) -> Itera
 
 def _stays_inside(one: _Recorded, reading: _Reading) -> bool:
     """Whether plots read in another way lie in the field of view no less than as they are."""
-    z, stands = _sampled(one)
-    as_read = _outside_view(one, reading.read(z, stands), stands)
-    return bool(as_read.mean() <= _outside_view(one, z, stands).mean() + 0.02)
+    plots = _Plots.of(one).sample
+    return bool(_outside(one, reading.of(plots)).mean() <= _outside(one, plots).mean() + 0.02)
 
 
-def _meetings(one: _Recorded, others: Sequence[_Recorded], read: Callable[[Array, Array], Array], speed: float) -> int:
+def _meetings(one: _Recorded, others: Sequence[_Recorded], reading: _Reading, speed: float) -> int:
     """How many of a sensor's plots have one of another sensor near them, in place and time."""
-    z, stands, times_s = _all(one)
-    places, near = _located(one, read(z, stands), stands), np.zeros(len(z), np.bool_)
+    plots = _Plots.of(one).rows(slice(_SAMPLE))
+    places, near = _located(one, reading.of(plots)), np.zeros(len(plots.z), np.bool_)
     for other in others:
-        span = max(float(np.median(each.intervals_s)) for each in (one, other) if len(each.scans) > 1)
-        z_other, stands_other, times_other = _all(other)
-        reach = 3.0 * (_noise(one, z, stands) + _noise(other, z_other, stands_other)) + speed * span
-        tree = cKDTree(np.column_stack([_located(other, z_other, stands_other) / reach, times_other / span]))
-        distance, _ = tree.query(np.column_stack([places / reach, times_s / span]), p=np.inf, distance_upper_bound=1.0)
+        theirs = _Plots.of(other).rows(slice(_SAMPLE))
+        span = max([float(np.median(each.intervals_s)) for each in (one, other) if len(each.scans) > 1], default=1.0)
+        reach = 3.0 * (_noise(one, plots) + _noise(other, theirs)) + speed * span
+        tree = cKDTree(np.column_stack([_located(other, theirs) / reach, theirs.times_s / span]))
+        query = np.column_stack([places / reach, plots.times_s / span])
+        distance, _ = tree.query(query, p=np.inf, distance_upper_bound=1.0)
         near |= np.isfinite(distance)
     return int(near.sum())
 
 
-def _all(one: _Recorded) -> tuple[Array, Array, Array]:
-    """Plots of the first scans, where the sensor stood, and when."""
-    counts = np.array([len(scan.z) for scan in one.scans])
-    last = int(np.searchsorted(np.cumsum(counts), _SAMPLE)) + 1
-    z = np.concatenate([scan.z for scan in one.scans[:last]])
-    stands = np.repeat(np.array([scan.position for scan in one.scans[:last]]), counts[:last], axis=0)
-    return z, stands, np.repeat(one.times_s[:last], counts[:last])
-
-
-def _noise(one: _Recorded, z: Array, stands: Array) -> float:
+def _noise(one: _Recorded, plots: _Plots) -> float:
     """A standard deviation of the places of plots [m]."""
-    middle = len(z) // 2
-    return float(np.sqrt(np.linalg.eigvalsh(_density(one, z[middle : middle + 1], stands[middle]).P).max()))
+    return float(np.sqrt(np.linalg.eigvalsh(_covariance(one, plots, len(plots.z) // 2)).max()))

@@ -75,10 +75,11 @@ def _of_sensor(scenario: Scenario, sensor: SensorConfig) -> Iterator[Finding]:
 
 def _too_dense(scenario: Scenario, config: SensorConfig, where: str) -> Iterator[Finding]:
     """False plots so dense that a plot right where a target is expected is no evidence of it."""
-    sensor = config.build(scenario.motion.build())
-    measurement, rng = sensor.measurement, np.random.default_rng(0)
-    stand = config.stand(scenario.motion.dimensions)
+    sensor, rng = config.build(scenario.motion.build()), np.random.default_rng(0)
+    pose = config.pose(scenario.motion.dimensions)
+    sensor, stand = sensor.at(pose), pose.position
     places = sensor.field_of_view.draw(rng, _DRAWN, config.view_center(stand))
+    measurement = sensor.measurement
     relative = sensor.log_relative(measurement.draw_false(rng, places, stand), stand)
     log_rho_f = sensor.log_rho_f + (0.0 if relative is None else float(np.median(relative)))
     volume = np.sqrt(np.linalg.det(2.0 * np.pi * measurement.R))
@@ -158,19 +159,20 @@ def _unseen(scenario: Scenario, scans: Sequence[Scan]) -> Iterator[Finding]:
 def _sees(scenario: Scenario, config: SensorConfig, scans: Sequence[Scan]) -> BoolArray:
     """Which hypotheses a sensor can see at any time, going straight on from their start, shape (K,)."""
     d, motion = scenario.motion.dimensions, scenario.motion.build()
-    view = config.build(motion).field_of_view
+    sensor = config.build(motion)
     own = [scan for scan in scans if scan.sensor == config.name]
     moments = [own[i] for i in np.unique(np.linspace(0, len(own) - 1, _POINTS).astype(int))] if own else []
-    stands = [(scenario.to_seconds(scan.time_ns), scan.position) for scan in moments]
-    if not stands:
+    poses = [(scenario.to_seconds(scan.time_ns), scan.pose) for scan in moments]
+    if not poses:
         length = scenario.simulation.duration if scenario.simulation else 60.0
-        stands = [(float(t), config.stand(d)) for t in np.linspace(0.0, length, _POINTS)]
+        poses = [(float(t), config.pose(d)) for t in np.linspace(0.0, length, _POINTS)]
     seen = np.zeros(len(scenario.hypotheses), np.bool_)
-    for time_s, stand in stands:
+    for time_s, pose in poses:
         left = np.flatnonzero(~seen)
         if not len(left):
             break
         at = _at(motion, [scenario.hypotheses[i] for i in left], np.full(len(left), time_s))
         position = Gaussian(at.x[:, :d], at.P[:, :d, :d])
-        seen[left] = view.probability_inside(position, config.view_center(stand)) > _UNSEEN
+        view, center = sensor.at(pose).field_of_view, config.view_center(pose.position)
+        seen[left] = view.probability_inside(position, center) > _UNSEEN
     return seen

@@ -13,7 +13,7 @@ from builders import hypothesis_table, scenario, sensor_table
 from common.config import Scenario, load_scenario
 from common.estimation.gaussian import Array
 from common.messages import Scan
-from launch.checks import recording_table, warn, warnings
+from launch.checks import describe, recording_table, warn
 from scenarios.catalogue import find, names
 from scenarios.plots import read_plots
 from scenarios.recording_check import recording_findings, summarise
@@ -164,6 +164,27 @@ def test_a_mistake_is_found(name: str, spoil: Any, said: str) -> None:
     assert any(said in text for text in found), found
 
 
+@pytest.mark.parametrize("kind", ["polar", "bearing", "position"])
+def test_a_field_of_view_that_turns_with_its_platform(kind: str) -> None:
+    """A vessel that turns around: plots in its view are right; azimuths from its bow, read as from north, are found."""
+    plot = world(kind)
+    config, motion = plot.sensor("a"), plot.motion.build()
+    rng, scans = np.random.default_rng(5), []
+    for k in range(60):
+        pose = config.pose(2, heading=0.1 * k)
+        sensor = config.build(motion).at(pose)
+        places = sensor.field_of_view.draw(rng, 3, pose.position)
+        z = sensor.measurement.draw_false(rng, places, pose.position)
+        scans.append(Scan("a", plot.to_ns(2.0 * k + 2.0), pose.position, z, pose.velocity, pose.heading))
+    outside = "of the plots lie outside the field of view"
+    assert not any(outside in text for text in texts(plot, scans, spoiling=False))
+    assert any(outside in text for text in texts(plot, [scan._replace(heading=0.0) for scan in scans]))
+    if kind != "position":
+        back = np.array([0.0, 1.0] if kind == "polar" else [1.0])
+        found = texts(plot, [scan._replace(z=scan.z - scan.heading * back) for scan in scans])
+        assert any("Read as azimuths counted from the heading of the platform" in text for text in found), found
+
+
 def test_the_spacing_that_is_advised_ends_the_warning() -> None:
     plot, scans = of_mistake("position")
     again = repeated(plot, scans)
@@ -274,4 +295,4 @@ def test_the_scans_of_a_simulated_world_are_not_checked(capsys: pytest.CaptureFi
 
 def test_a_note_is_no_warning() -> None:
     found = [Finding("sensor a", "is late."), Finding("sensor b", "is early.", spoils=False)]
-    assert list(warnings(found)) == ["warning: sensor a: is late.", "note: sensor b: is early."]
+    assert list(describe(found)) == ["warning: sensor a: is late.", "note: sensor b: is early."]

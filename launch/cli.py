@@ -9,6 +9,7 @@ from contextlib import nullcontext
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
+from textwrap import fill
 from typing import Annotated
 
 from cyclopts import App, Parameter
@@ -23,6 +24,7 @@ from common.messages import Tracks
 from common.process import HealthSocket, NetworkOptions, Seconds, Seed, Speed, Verbose
 from common.process import main as run_app
 from fusion_center.app import center
+from launch.measuring import measure
 from scenarios.catalogue import find, names
 from sensor_node.app import node
 from studies.cli import study
@@ -38,6 +40,7 @@ app.command(center)
 app.command(study)
 app.command(evaluate)
 app.command(bench)
+app.command(measure)
 
 
 @app.command
@@ -174,7 +177,9 @@ def check(
         strict: end with exit code 1 if there is a warning (notes are none).
     """
     from launch.checks import describe, findings, read_recording, recording_table
+    from launch.measuring import describe_false_tracks
     from scenarios.trajectories import read_trajectories
+    from studies.false_tracks import false_tracks
 
     loaded = load_scenario(find(scenario))
     fusion = loaded.fusion
@@ -189,6 +194,8 @@ def check(
         print("\n".join(recording_table(loaded, scans)))
     if trajectories := read_trajectories(loaded):
         print(f"recorded targets: {len(trajectories)}")
+    if (bound := false_tracks(loaded)) is not None:
+        print(fill(describe_false_tracks(bound, loaded.decision.p0), 120))
     found += findings(loaded, scans)
     for line in describe(found):
         print(line)

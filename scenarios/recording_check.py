@@ -423,7 +423,7 @@ def _outside_directions(one: _Recorded, plots: _Plots) -> BoolArray:
 def _offsets(one: _Recorded, plots: _Plots) -> Array:
     """Places of plots from the center of the field of view [m], shape (M, d)."""
     centers = np.array([one.config.view_center(stand) for stand in plots.stands]).reshape(-1, one.dimensions)
-    return _located(one, plots) - centers
+    return np.asarray(_located(one, plots) - centers)
 
 
 def _turns(one: _Recorded, plots: _Plots) -> Array:

@@ -6,6 +6,7 @@ next.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -51,13 +52,22 @@ def read_trajectories(scenario: Scenario) -> list[Trajectory]:
     """
     if scenario.simulation is None or scenario.simulation.truth is None:
         return []
-    path = scenario.simulation.truth
+    return list(trajectories_of(scenario.simulation.truth, scenario).values())
+
+
+def trajectories_of(path: Path, scenario: Scenario) -> dict[int, Trajectory]:
+    """Trajectories of a file of true positions, by the numbers of the targets.
+
+    Raises:
+        TruthError: naming file and reason, and the line that is wrong.
+    """
     targets = read_truth(path, (scenario.motion.dimensions,))
     if not targets:
         raise TruthError(f"{path}: has no position, expected one a line")
-    found = []
+    found = {}
     for target, (times_s, positions) in targets.items():
         if len(times_s) < 2:
             raise TruthError(f"{path}: target {target} has one position, expected two or more")
-        found.append(Trajectory(np.array([scenario.to_ns(time_s) for time_s in times_s.tolist()]), positions))
+        times_ns = np.array([scenario.to_ns(time_s) for time_s in times_s.tolist()])
+        found[target] = Trajectory(times_ns, positions)
     return found

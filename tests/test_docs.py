@@ -21,6 +21,7 @@ HOW_TO = (ROOT / "docs/how-to/first-network.md").read_text()
 STUDY = (ROOT / "docs/how-to/study.md").read_text()
 SENSORS = (ROOT / "docs/how-to/sensors.md").read_text()
 EVALUATE = (ROOT / "docs/how-to/evaluate.md").read_text()
+MEASURE = (ROOT / "docs/how-to/measure.md").read_text()
 DEPLOY = (ROOT / "docs/how-to/deploy.md").read_text()
 WALDNET = str(Path(sys.executable).with_name("waldnet"))
 
@@ -187,6 +188,12 @@ def test_how_to_evaluate_simulations(tmp_path: Path) -> None:
     for words in steps:
         run(words, tmp_path)
     assert (tmp_path / "four-radars/comparison.png").exists()
+
+
+def test_how_to_measure() -> None:
+    said = [run(words, ROOT) for words in commands(MEASURE)]
+    assert blocks(MEASURE, "text")[0] in said[0]
+    assert "Targets are the confirmed tracks" in said[1]
 
 
 def test_schema_is_the_one_the_program_prints() -> None:

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from common.estimation.gaussian import Array
 from common.estimation.sight import to_polar
 from scenarios.autoferry.convert import CAMERAS, SCENARIOS
-from scenarios.autoferry.persistence import LAG_S, Watch, correlation, fitted, watches
+from scenarios.measure import assign
+from scenarios.persistence import LAG_S, Watch, correlation, fitted, watches
 
 #: Up to where a boat is looked for [m].
 REACH = {"radar": 500.0, "lidar": 125.0, "daylight": 300.0, "infrared": 300.0}
@@ -87,8 +87,7 @@ def _look(scan: dict[str, Any], boats: dict[int, Array]) -> Look:
     z = np.array(scan["plots"]).reshape(-1, 1 if camera else 2)
     errors = _turn(z - polar[:, None, 1:]) if camera else z - places[:, None]
     distances, near = np.linalg.vector_norm(errors, axis=-1), NEAR_RAD if camera else NEAR_M
-    pairs = zip(*linear_sum_assignment(np.where(distances < near, distances, 1e6)), strict=True)
-    found = {int(boat): errors[boat, plot] for boat, plot in pairs if distances[boat, plot] < near}
+    found = {int(boat): errors[boat, plot] for boat, plot in zip(*assign(distances, near), strict=True)}
     in_line = bool(np.abs(_turn(np.diff(polar[:, 1]))) < IN_LINE_RAD)
     ranges = polar[:, 0]
     seen = tuple(

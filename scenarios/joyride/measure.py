@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from common.estimation.gaussian import Array
-from scenarios.autoferry.persistence import Watch, fitted
+from scenarios.persistence import Watch, fitted
 
 #: How far from the boat its plot may be [m].
 NEAR_M = 50.0

@@ -1,4 +1,4 @@
-"""How long the ferry's sensors see a boat and lose it, and how long their errors last."""
+"""How long sensors see a target and lose it, and how long their errors last."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from common.estimation.gaussian import Array
+from common.estimation.gaussian import Array, BoolArray
 from common.estimation.visibility import Visibility
 
 #: Errors so long apart are compared [s].
@@ -18,7 +18,7 @@ LAG_S = 2.0
 
 
 class Watch(NamedTuple):
-    """A boat within reach of a sensor, scan after scan.
+    """A target within reach of a sensor, scan after scan.
 
     Attributes:
         times_s: of the scans, shape (K,).
@@ -45,12 +45,12 @@ class Persistence(NamedTuple):
     gained: float
 
 
-def watches(times_s: Array, within: Array, errors: Array) -> list[Watch]:
-    """The stretches of scans during which a boat is within reach.
+def watches(times_s: Array, within: BoolArray, errors: Array) -> list[Watch]:
+    """The stretches of scans during which a target is within reach.
 
     Args:
         times_s: of all scans, shape (K,).
-        within: whether the boat is in reach, shape (K,).
+        within: whether the target is in reach, shape (K,).
         errors: of its plots, NaN where there is none, shape (K, m).
     """
     stretches = (list(rows) for there, rows in groupby(range(len(times_s)), key=lambda k: bool(within[k])) if there)
@@ -70,7 +70,7 @@ def fitted(seen_by: Sequence[Watch]) -> Persistence:
     )
     found = np.concatenate([watch.found for watch in seen_by])
     alone = np.log(found.mean()) * found.sum() + np.log(1.0 - found.mean()) * (~found).sum()
-    visibility = Visibility(*np.exp(best.x[1:]).tolist())
+    visibility = Visibility(*np.exp(np.clip(best.x[1:], -5.0, 10.0)).tolist())
     return Persistence(float(expit(best.x[0])), visibility, float(-best.fun - alone) / len(found))
 
 
@@ -92,7 +92,7 @@ def correlation(seen_by: Sequence[Watch], lag_s: float = LAG_S) -> float:
     both = np.zeros(3)
     for watch in seen_by:
         t, e = watch.times_s[watch.found], watch.errors[watch.found]
-        later = np.searchsorted(t, t + lag_s - 0.05)
+        later = np.searchsorted(t, t + 0.975 * lag_s)
         first = np.flatnonzero(later < len(t))
         second = later[first]
         close = np.abs(t[second] - t[first] - lag_s) < 0.25 * lag_s

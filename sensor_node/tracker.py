@@ -128,7 +128,7 @@ class LocalTracker:
         advice = tuple(later for later in state.advice if later.time_ns >= look.time_ns)
         kept = tuple(old for old in state.recent if old.time_ns >= look.time_ns - self.buffer_ns)
         if self.advised:
-            look = with_before(look, self._beliefs(take(ready.advised, ready.live)))
+            look = look._replace(before=self._beliefs(take(ready.advised, ready.live)))
         if self.selection is None:
             report: Report | Picked = self._report(state, look, next_ns, filtered.ids, mixture, unclaimed)
         else:

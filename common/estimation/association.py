@@ -179,6 +179,8 @@ def _in_view(honest: Gaussian, clutter: Clutter) -> tuple[Array, Array, BoolArra
     if clutter.view is None:
         return clutter.p_d, clutter.p_d, None
     inside = clutter.view.probability_inside(honest)
+    if (inside == 1.0).all():
+        return clutter.p_d, clutter.p_d, None
     edge = (inside > 0.0) & (inside < 1.0)
     mean = clutter.p_d * inside
     return mean, np.where(edge, clutter.p_d, mean), edge if edge.any() else None

@@ -105,7 +105,7 @@ def test_amid_the_view_no_digit_changes_and_nothing_is_worked_out(monkeypatch: p
     np.testing.assert_array_equal(inside.log_hit, everywhere.log_hit)
 
 
-def test_beside_a_track_at_the_edge_the_others_keep_every_digit() -> None:
+def test_beside_a_vagueat_the_edge_the_others_keep_every_digit() -> None:
     both, z, view = flat()
     ours, alone = (update(seen(both, where), Plots(z)) for where in (view, None))
     assert seen(both, view).edge.tolist() == [True, True, True, False, False]
@@ -136,7 +136,7 @@ def test_who_sees_everything_has_no_edge(field: FieldOfView) -> None:
     assert Sensor(Position((1.0, 1.0), 4), P_D, 1.0, field).view(np.zeros(2)) is None
 
 
-def test_a_track_that_is_surely_outside_learns_nothing() -> None:
+def test_a_vaguethat_is_surely_outside_learns_nothing() -> None:
     both, _, view = flat(1)
     far = Gaussian(both.x + np.array([5e4, 0.0, 0.0, 0.0]), both.P)
     after = update(seen(far, view), Plots(far.x[-1, :, :2]))
@@ -190,6 +190,25 @@ def test_every_filter_weighs_alike() -> None:
     group = cluster(Gaussian(one.x[0, 1:2], one.P[0, 1:2]), 1)
     last = next(extract_cluster(ClusterTest(still, limits, gate_probability=0.999), group, 0.0, [scan]))
     np.testing.assert_allclose(last.log_lr, log_p_bar[1:2], rtol=1e-9)
+
+
+@pytest.mark.parametrize("shape", [Box((200.0, 160.0)), Disc(100.0, 2)])
+def test_without_a_target_the_weight_sum_is_one_on_average(shape: FieldOfView) -> None:
+    """Plots are then false ones, of the density rho_f in the view: else log LR would drift and its test err.
+
+    What a target at the edge causes beyond it is missing: 5 % of the hits here.
+    """
+    vague = Gaussian(np.array([[60.0, -40.0, 0.0, 0.0]]), np.diag([9e4, 9e4, 1.0, 1.0])[None])
+    linear = Position((5.0, 5.0), 4).linearise(vague, np.zeros(2))
+    clutter = Clutter(np.asarray(P_D), np.array(LOG_RHO_F), 1.0, View(shape, np.zeros(2)))
+    expected = expect(vague, linear, clutter)
+    grid = np.linspace(-100.0, 100.0, 201)[:-1] + 0.5
+    z = np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)
+    z = z[shape.contains(z, np.zeros(2))]
+    weights = np.exp(weights_alone(expected, within_reach(expected, Plots(z))))
+    hits = np.exp(LOG_RHO_F) * weights[1:].sum()
+    assert 0.03 < 1.0 - weights[0] < 0.06
+    assert hits == pytest.approx(1.0 - weights[0], rel=0.05)
 
 
 def test_where_detection_depends_on_the_state_its_mean_stays() -> None:

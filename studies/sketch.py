@@ -5,6 +5,7 @@ from __future__ import annotations
 from array import array
 from collections import Counter
 from collections.abc import Sequence
+from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -91,15 +92,11 @@ class _Course:
         self._log_lr = self._total = 0.0
         self.status, self.confirmed = Status.TENTATIVE, False
 
-    def add(self, time_s: float, tracks: Tracks, row: int) -> None:
-        log_lr, total = float(tracks.log_lr[row]), float(tracks.log_lr_total[row])
-        with np.errstate(invalid="ignore"):
-            step = np.float64(self._log_lr) + (np.float64(total) - self._total)
-        reached = float(np.nan_to_num(step, nan=_LOWEST, neginf=_LOWEST))
-        (east, north), P = tracks.x[row, :2].tolist(), tracks.P[row]
-        self._rows.add((time_s, reached, max(log_lr, _LOWEST), east, north, P[0, 0], P[0, 1], P[1, 1]))
+    def add(self, time_s: float, status: int, log_lr: float, total: float, place: Sequence[float]) -> None:
+        reached = self._log_lr + (total - self._total)
+        self._rows.add((time_s, reached if isfinite(reached) else _LOWEST, max(log_lr, _LOWEST), *place))
         self._log_lr, self._total = log_lr, total
-        self.status = Status(int(tracks.status[row]))
+        self.status = Status(status)
         self.confirmed |= self.status == Status.CONFIRMED
 
     def history(self) -> History:
@@ -136,8 +133,12 @@ class Sketch:
     def add_picture(self, tracks: Tracks) -> None:
         """Add the picture of the next measurement time."""
         time_s, now = self.scenario.to_seconds(tracks.time_ns), tracks.ids.tolist()
-        for row, track in enumerate(now):
-            self._courses.setdefault(track, _Course()).add(time_s, tracks, row)
+        places = np.column_stack([tracks.x[:, :2], tracks.P[:, 0, 0], tracks.P[:, 0, 1], tracks.P[:, 1, 1]])
+        columns = (tracks.status, tracks.log_lr, tracks.log_lr_total, places)
+        for track, *values in zip(now, *(column.tolist() for column in columns), strict=True):
+            if track not in self._courses:
+                self._courses[track] = _Course()
+            self._courses[track].add(time_s, *values)
         for track in sorted(self._live.difference(now)):
             self._outcome[self._courses[track].status] += 1
             self._ended[track] = None

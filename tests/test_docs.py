@@ -139,7 +139,7 @@ def test_how_to_deploy_without_docker(tmp_path: Path) -> None:
         others = [[*watch, "--until-end"], [*center, "--speed", "max"], *nodes]
         started = [processes.start(*(word.replace("tcp/192.168.1.7:7447", at) for word in words)) for words in others]
         assert [process.wait() for process in started] == 6 * [0]
-        assert "    2.00 s  track 0 confirmed after 1 scans, log LR +33.33" in started[0].out
+        assert "2026-01-01 00:00:02.00Z     2.00 s  track 0 confirmed after 1 scans, log LR +33.33" in started[0].out
 
 
 def test_the_health_shown_is_that_of_a_node() -> None:

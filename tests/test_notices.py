@@ -18,7 +18,7 @@ from process_helpers import ANY_PORT, PATIENCE_S, Processes, free_endpoint, log_
 from rich.console import Console
 from structlog.testing import capture_logs
 
-from common import health, notice
+from common import clock, health, notice
 from common.clock import now_ns
 from common.codec import decode, encode
 from common.config import Network, Scenario, load_scenario
@@ -155,10 +155,10 @@ def test_the_sensor_whose_clock_is_wrong_is_told_of(offset_s: float) -> None:
     plot = scenario(hypothesis=[], target=[], fusion={"hold_back": 0.5, "window": 1000.0})
     with running(plot, speed=1.0) as network:
         a, b = (network.sensor(name, 2.0) for name in "ab")
-        clock = b.clock.get(timeout=PATIENCE_S)
+        runs = b.clock.get(timeout=PATIENCE_S)
         for number in range(20):
             for sensor, by_s in ((b, 0.0), (a, offset_s)):
-                time_ns = clock.present_ns(now_ns()) + round(by_s * NS_PER_S) + number
+                time_ns = runs.present_ns(now_ns()) + round(by_s * NS_PER_S) + number
                 sensor.report(time_ns, time_ns + 1)
         told = a.await_notice("clock")
         found = network.health()["clock_offset_s_of"]
@@ -168,8 +168,26 @@ def test_the_sensor_whose_clock_is_wrong_is_told_of(offset_s: float) -> None:
     assert found["b"] == pytest.approx(0.0, abs=0.5)
 
 
+def set_clock(monkeypatch: pytest.MonkeyPatch, by_s: float) -> None:
+    """Set the wall clock of all that runs here."""
+    real = clock.time.time_ns
+    monkeypatch.setattr(clock.time, "time_ns", lambda: real() + round(by_s * NS_PER_S))
+
+
+def test_the_clock_is_told_as_wall_time_of_the_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    set_clock(monkeypatch, -3600.0)
+    with running(scenario(), speed=1.0) as network:
+        a, _ = (network.sensor(name, 2.0) for name in "ab")
+        told = a.clock.get(timeout=PATIENCE_S)
+    assert (now_ns() - told.wall_ns) / NS_PER_S == pytest.approx(3600.0, abs=PATIENCE_S)
+
+
+@pytest.mark.parametrize("set_by_s", [0.0, -3600.0])
 @pytest.mark.parametrize("offset_s", [60.0, -60.0, 0.0])
-def test_a_node_notices_that_its_clock_is_not_the_centers_and_skips_nothing(offset_s: float) -> None:
+def test_a_node_notices_that_its_clock_is_not_the_centers_and_skips_nothing(
+    monkeypatch: pytest.MonkeyPatch, offset_s: float, set_by_s: float
+) -> None:
+    set_clock(monkeypatch, set_by_s)
     plot, memory, inbox = scenario(hypothesis=[], target=[]), MemoryNetwork(), Inbox()
     keys, joined, answers = Keys(plot.network.name), SimpleQueue[bytes](), SimpleQueue[Health]()
     scans = [Scan("a", plot.to_ns(time_s), np.zeros(2), np.empty((0, 2))) for time_s in (2.0, 1000.0)]
@@ -184,7 +202,8 @@ def test_a_node_notices_that_its_clock_is_not_the_centers_and_skips_nothing(offs
         joined.get(timeout=PATIENCE_S)
         ids, x, P = np.empty(0, np.int64), np.empty((0, 4)), np.empty((0, 4, 4))
         command.put(encode(Start("a", 1, ids, ids, np.empty(0), x, P, x, P)))
-        clocks.put(encode(Clock(plot.to_ns(2.0), now_ns() - round(offset_s * NS_PER_S), 1.0, plot.to_ns(2.0))))
+        wall_ns = clock.time.time_ns() - round(offset_s * NS_PER_S)
+        clocks.put(encode(Clock(plot.to_ns(2.0), wall_ns, 1.0, plot.to_ns(2.0))))
         inbox.asked(answers.put)
         found = answers.get(timeout=PATIENCE_S)
         if offset_s >= 0.0:

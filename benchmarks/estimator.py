@@ -32,6 +32,7 @@ from common.estimation.sprt import thresholds
 from common.messages import NEVER, Report
 from common.quantities import NS_PER_S
 from fusion_center.factors import Fuser, Heard
+from fusion_center.life import Life
 
 PACKAGES = ("numpy", "scipy", "stonesoup")
 BATCHES = (1, 10, 100, 1000)
@@ -93,13 +94,14 @@ def center_scan(tracks: int) -> Callable[[], object]:
     prior, _ = world(tracks)
     ids, now = np.arange(tracks), np.zeros(tracks, np.int64)
     sensor = Sensor(SENSOR, P_D, 5.0, Everywhere(5.0 / RHO_F, 2))
-    fuser = Fuser(MOTION, (sensor,) * SENSORS, Share(SENSORS), 1, thresholds(1e-4, 0.95), globalised=False)
+    fuser = Fuser(MOTION, (sensor,) * SENSORS, Share(SENSORS), 1, np.inf, globalised=False)
+    life = Life(thresholds(1e-4, 0.95), None, (), 2)
     picture = fuser.begin(fuser.empty(), ids, now, prior)
     x, P, log_g = prior.x + 10.0, 0.5 * SENSORS * prior.P, np.ones(tracks)
     later = round(DT * NS_PER_S)
     report = Report("", 0, later, NEVER, 1, ids, np.ones_like(ids), log_g, x, P)
     reports = {number: Heard.of(report) for number in range(SENSORS)}
-    return lambda: fuser.advance(fuser.expect(picture, later), reports)
+    return lambda: life.judge(fuser.advance(fuser.expect(picture, later), reports), later, ())
 
 
 def stone_soup_scan() -> Callable[[], object]:

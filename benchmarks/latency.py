@@ -237,7 +237,7 @@ def _sizes(cell: Cell) -> tuple[int, int]:
     now = time.time_ns()
     report = Report(names[0], 1, now, now, now, ids, np.ones_like(ids), zeros, x, P)
     who = np.zeros((tracks, len(names)), np.bool_)
-    picture = Tracks(now, names, ids, zeros.astype(np.uint8), ids, who, zeros, zeros, x, P)
+    picture = Tracks(now, names, ids, zeros.astype(np.uint8), ids, who, zeros, zeros, x, P, ids)
     return len(encode(report)), len(encode(picture))
 
 

@@ -38,7 +38,7 @@ from common.messages import (
     sensor_of,
 )
 
-VERSION = 3
+VERSION = 4
 
 
 class Block(NamedTuple):
@@ -80,6 +80,7 @@ def _unclaimed(dtype: str, *, relative: bool = False) -> tuple[Block, ...]:
 
 
 _IDS = Block("ids", "<u4", ("T",), "i8")
+_SUPPORTED = Block("supported", "u1", ("L",), "?")
 _TERMS = Block("terms", "u1", ("T",), "i8")
 _BEGUN = (
     _IDS,
@@ -98,7 +99,7 @@ def _rounded_report(*, plots: bool) -> tuple[type, tuple[Block, ...]]:
     """A report with rounded densities and plots, which may be positions; log g, which grows without end, is not."""
     densities = Block("x", "<f4", ("N", "n"), relative=True), Block("P", "<f4", ("N", "n^"))
     unclaimed = _unclaimed("<f4", relative=plots)
-    return Report, (_IDS, _TERMS, _floats("log_g", "N"), *densities, *unclaimed, _REFERENCE)
+    return Report, (_IDS, _TERMS, _floats("log_g", "N"), *densities, *unclaimed, _REFERENCE, _SUPPORTED)
 
 
 def _rounded_picked(*, plots: bool) -> tuple[type, tuple[Block, ...]]:
@@ -114,7 +115,15 @@ ROUNDED = {(Report, True): 10, (Report, False): 15, (Picked, True): 14, (Picked,
 LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
     1: (
         Report,
-        (_IDS, _TERMS, _floats("log_g", "N"), _floats("x", "N", "n"), _floats("P", "N", "n^"), *_unclaimed("<f8")),
+        (
+            _IDS,
+            _TERMS,
+            _floats("log_g", "N"),
+            _floats("x", "N", "n"),
+            _floats("P", "N", "n^"),
+            *_unclaimed("<f8"),
+            _SUPPORTED,
+        ),
     ),
     2: (Scan, (_floats("position", "d"), _floats("z", "M", "m"))),
     3: (Join, ()),
@@ -144,6 +153,7 @@ LAYOUTS: dict[int, tuple[type, tuple[Block, ...]]] = {
             _floats("log_lr_total", "T"),
             _floats("x", "T", "n"),
             _floats("P", "T", "n^"),
+            Block("supported_ns", "<i8", ("T",), "i8"),
         ),
     ),
     9: (Decision, ()),
@@ -416,6 +426,8 @@ def _check_counts(message: Message) -> None:
             raise DecodeError(f"epoch {epoch} or next_id {next_id} is none that a center could count on from")
         case Report(terms=terms, log_g=log_g) if (terms < 1).any() or terms.sum() != len(log_g):
             raise DecodeError(f"{int(terms.sum())} terms of tracks, {len(log_g)} terms sent")
+        case Report(ids=ids, supported=supported) if len(supported) not in (0, len(ids)):
+            raise DecodeError(f"{len(supported)} tracks supported or not, {len(ids)} tracks sent")
         case Picked(plots=plots, which=which, z=z) if plots.sum() != len(which) or (which >= len(z)).any():
             raise DecodeError(f"{int(plots.sum())} plots of tracks, {len(which)} places sent among {len(z)} plots")
         case Tracks(contributing=who, sensors=names) if who.shape[1] != len(names):

@@ -10,15 +10,16 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
 from common.errors import ConfigError
 from common.estimation.gaussian import Gaussian
 from common.estimation.representation import Share
 from common.estimation.sprt import Thresholds, thresholds
-from common.fusion_config import FusionConfig, fusion_faults
+from common.fusion_config import FusionConfig, can_use_advice, fusion_faults
 from common.initiation_config import InitiationConfig, initiation_faults
+from common.life_config import LifeConfig
 from common.motion_config import MotionConfig, motion_faults, numbers_per_axis
 from common.quantities import (
     NS_PER_S,
@@ -40,7 +41,9 @@ from common.sensor_config import SensorConfig as SensorConfig
 from common.sensor_config import sensor_faults, wrong_length
 
 #: What nodes and center must have in common.
-_COMMON = {"epoch", "motion", "initiation", "fusion", "sensors"}
+_COMMON = {"epoch", "motion", "initiation", "life", "fusion", "sensors"}
+#: Slow targets have this share of the usual speed.
+_SLOW = 0.25
 #: Tables that come in kinds, and the key that tells which.
 _TAGGED = {"field_of_view": "shape", "detection": "model"}
 
@@ -174,6 +177,7 @@ class Scenario(Model):
     motion: MotionConfig
     decision: DecisionConfig = DecisionConfig()
     initiation: InitiationConfig | None = None
+    life: LifeConfig | None = None
     fusion: FusionConfig = FusionConfig()
     sensors: Annotated[tuple[SensorConfig, ...], Field(alias="sensor", min_length=1)]
     simulation: SimulationConfig | None = None
@@ -182,6 +186,17 @@ class Scenario(Model):
     clutter_sources: Annotated[tuple[ClutterSourceConfig, ...], Field(alias="clutter_source")] = ()
     targets: Annotated[tuple[TargetConfig, ...], Field(alias="target")] = ()
     hypotheses: Annotated[tuple[HypothesisConfig, ...], Field(alias="hypothesis")] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _where_tracks_start(cls, data: Any) -> Any:
+        """Where tracks start by themselves they have a life, and nodes are told where to look if they can use it."""
+        if not isinstance(data, dict) or data.get("initiation") is None:
+            return data
+        fusion = data.get("fusion", {})
+        if isinstance(fusion, dict) and "feedback" not in fusion and can_use_advice(fusion):
+            fusion = {**fusion, "feedback": "advice"}
+        return {**data, "fusion": fusion, "life": data.get("life", {})}
 
     @property
     def epoch_ns(self) -> int:
@@ -227,6 +242,21 @@ class Scenario(Model):
     def joint(self) -> bool:
         """Whether tracks that share plots are associated jointly."""
         return self.initiation is not None if self.fusion.joint is None else self.fusion.joint
+
+    @property
+    def extent(self) -> float:
+        """Of the largest field of view [m]; infinite where none has an end."""
+        extents = [sensor.field_of_view.extent(self.motion.dimensions) for sensor in self.sensors]
+        return max((extent for extent in extents if extent is not None), default=np.inf)
+
+    @property
+    def stay(self) -> float:
+        """Mean time that targets stay [s]."""
+        if self.life is None:
+            return np.inf
+        if self.life.stay is not None:
+            return self.life.stay
+        return np.inf if self.initiation is None else self.extent / (_SLOW * self.initiation.speed)
 
     @property
     def share(self) -> Share:

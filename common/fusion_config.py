@@ -58,6 +58,7 @@ class FusionConfig(BaseModel, extra="forbid", frozen=True):
         association: the factor's own, tight, or mirrored: hypotheses kept in both filters (theory.md §5).
         terms: most terms of a track in a report; more than one only where association is mirrored.
         feedback: advice gives the fused track back to the association filters, reset to the factors (theory.md §3, 6).
+            Default: advice where tracks start by themselves and nodes have such filters, else none.
         feedback_delay: measurement time that goes by before feedback counts [s]; with reset, nobody is left out who
             hears of it in that time.
         filter: local filter; default: mht where association is mirrored or mode selected, else pdaf.
@@ -93,6 +94,12 @@ class FusionConfig(BaseModel, extra="forbid", frozen=True):
         return None if name == "mht" else CHOICES[name]
 
 
+def can_use_advice(fusion: Mapping[str, Any]) -> bool:
+    """Whether nodes of a ``[fusion]`` table have an association filter of a single Gaussian, which advice steers."""
+    tight = fusion.get("association", "tight") == "tight" and fusion.get("filter") != "mht"
+    return tight and fusion.get("mode", "federated") != "selected"
+
+
 def fusion_faults(fusion: Mapping[str, Any], motion_model: Any) -> Iterator[str]:
     """Faults between keys of ``[fusion]``, and with the motion model; tolerant of whatever else is wrong."""
     mode, association, filter_ = (
@@ -100,7 +107,7 @@ def fusion_faults(fusion: Mapping[str, Any], motion_model: Any) -> Iterator[str]
     )
     feedback, terms = fusion.get("feedback", "none"), fusion.get("terms", 1)
     mixture = association == "mirrored" or filter_ == "mht"
-    if feedback == "advice" and (association != "tight" or mixture):
+    if feedback == "advice" and not can_use_advice({**fusion, "mode": "federated"}):
         yield (
             "fusion.feedback: 'advice' steers the association filter of a single Gaussian, "
             "which only association = 'tight' with another filter than 'mht' has"

@@ -19,8 +19,13 @@ from common.estimation.association import (
     within_reach,
 )
 from common.estimation.detection import Notch
+<<<<<<< HEAD
 from common.estimation.gaussian import Array, Gaussian, log_sum_exp
 from common.estimation.imm import Imm, Modes, predict_modes, predict_probabilities
+=======
+from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
+from common.estimation.imm import Imm, Modes, predict_modes
+>>>>>>> 62ab499 (Tracks have a life: survival, coasting, lost; whether two confirmed tracks are one is a sequential test)
 from common.estimation.joint import joint
 from common.estimation.mixture import Mixture, Reduction, step, step_with, terms
 from common.estimation.motion import Motion
@@ -33,6 +38,8 @@ from common.estimation.visibility import seen
 HONEST = Share(1.0)
 #: Log odds of existence go no farther than this, so that a target that has gone is soon believed to be.
 SUREST = 7.0
+#: A scan with a log weight sum (Eq. 6) above this supports a track.
+_LOG_SUPPORT = float(np.log(2.0))
 #: Log odds, at the start of a track, of a thing that stands still against a target, for a map of false plots.
 DOUBT = 5.0
 
@@ -254,6 +261,22 @@ class LocalFilter:
         """
         weights = predicted.log_w[..., None] + _log_p_star(expected, near, sensor, stand)
         return seen(v, log_sum_exp(log_sum_exp(weights)))
+
+    def supported(self, predicted: Mixture, expected: Expected, near: Plots, sensor: Sensor, stand: Array) -> BoolArray:
+        """Which tracks a scan supports: each taken by itself, the scan makes it at least twice as probable.
+
+        Args:
+            predicted: the tracks.
+            expected: the same, as the sensor will see them.
+            near: the plots near them, not associated jointly: of two tracks of one target the plot supports both.
+            sensor: the sensor model.
+            stand: where it stands [m], shape (d,).
+
+        Returns:
+            shape (T,).
+        """
+        weights = predicted.log_w[..., None] + _log_p_star(expected, near, sensor, stand)
+        return np.asarray(log_sum_exp(log_sum_exp(weights)) > _LOG_SUPPORT)
 
     def report(self, mixture: Mixture) -> Mixture:
         """The terms of a report."""

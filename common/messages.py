@@ -20,7 +20,7 @@ IntArray = NDArray[np.int64]
 #: No report will follow: a source that is exhausted.
 NEVER = 2**63 - 1
 #: Where a report has no such field.
-_NOWHERE, _NO_PLOTS = np.empty(0), np.empty((0, 0))
+_NOWHERE, _NO_PLOTS, _NOBODY = np.empty(0), np.empty((0, 0)), np.empty(0, np.bool_)
 
 
 class Report(NamedTuple):
@@ -39,10 +39,12 @@ class Report(NamedTuple):
         log_g: cumulative log p_bar (with one term) or log evidence g, shape (N,).
         x: means, shape (N, n).
         P: covariances, shape (N, n, n).
-        position: where the sensor stood [m], shape (d,); with unclaimed plots only.
+        position: where the sensor stood [m], shape (d,); where tracks start or have a life only.
         unclaimed: plots that no track claims, from which tracks may start (theory.md §8), shape (U, m).
         velocity: of the sensor over ground [m/s], shape (d,); (0,) where it is not told.
         heading: of its platform [rad], clockwise from north.
+        supported: tracks that the plots of the scan make at least twice as probable, shape (T,); where tracks have no
+            life, shape (0,).
     """
 
     sensor: str
@@ -64,6 +66,8 @@ class Report(NamedTuple):
     def pose(self) -> SensorPose:
         """Where the sensor was, and how it moved."""
         return SensorPose(self.position, self.velocity, self.heading)
+
+    supported: BoolArray = _NOBODY
 
 
 class Picked(NamedTuple):
@@ -274,12 +278,13 @@ class Tracks(NamedTuple):
         time_ns: the measurement time.
         sensors: names of the sensors, in the order of ``contributing``.
         ids: tracks, ascending, shape (T,); those deleted at this time for the last time.
-        status: 0 tentative, 1 confirmed, 2 deleted, shape (T,).
+        status: 0 tentative, 1 confirmed, 2 deleted, 3 coasting: confirmed, but not seen lately, shape (T,).
         scans: measurement times used so far, shape (T,).
         contributing: who reported the track at this time, shape (T, S).
-        log_lr: since the last reset, shape (T,).
-        log_lr_total: since the start, shape (T,).
+        log_lr: of the test (theory.md §7), shape (T,).
+        log_lr_total: the sum of all log Lambda since the start, shape (T,).
         x, P: fused densities, shapes (T, n), (T, n, n).
+        supported_ns: time of the last scan with a plot that was the track's, the start at first, shape (T,).
     """
 
     time_ns: int
@@ -292,17 +297,19 @@ class Tracks(NamedTuple):
     log_lr_total: Array
     x: Array
     P: Array
+    supported_ns: IntArray
 
 
-DecisionKind: TypeAlias = Literal["confirmed", "deleted", "merged", "withdrawn"]
+DecisionKind: TypeAlias = Literal["confirmed", "deleted", "lost", "merged", "withdrawn"]
 
 
 class Decision(NamedTuple):
     """One decision about one track.
 
     Attributes:
-        kind: confirmed; deleted; merged: it was another track's target; or withdrawn: a late report undid what was
-            decided.
+        kind: confirmed; deleted: the test accepted that there is no target; lost: no sensor can see where it may be,
+            or nobody knows any more where that is; merged: it was another track's target; or withdrawn: a late report
+            undid what was decided.
         track: its id.
         time_ns: measurement time of the data that decided.
         log_lr: that crossed the threshold.

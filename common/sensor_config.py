@@ -63,6 +63,10 @@ class EverywhereConfig(Model):
         """The field of view."""
         return AllAround(dimensions) if self.area is None else Everywhere(self.area, dimensions)
 
+    def extent(self, dimensions: int) -> float | None:
+        """Side of the square or cube [m]; None: there is no end."""
+        return None if self.area is None else float(self.area ** (1.0 / dimensions))
+
 
 class BoxConfig(Model):
     """A box with full side lengths ``size`` [m]; without a center it moves and turns with the sensor."""
@@ -75,6 +79,10 @@ class BoxConfig(Model):
         """The field of view."""
         return Box(self.size)
 
+    def extent(self, dimensions: int) -> float:  # noqa: ARG002
+        """Longest side [m]."""
+        return max(self.size)
+
 
 class DiscConfig(Model):
     """A disc, in 3-D a ball, of ``radius`` [m]; without a center it moves with the sensor."""
@@ -86,6 +94,10 @@ class DiscConfig(Model):
     def build(self, dimensions: int) -> FieldOfView:
         """The field of view."""
         return Disc(self.radius, dimensions)
+
+    def extent(self, dimensions: int) -> float:  # noqa: ARG002
+        """Diameter [m]."""
+        return 2.0 * self.radius
 
 
 class SectorConfig(Model):
@@ -110,6 +122,10 @@ class SectorConfig(Model):
         """The field of view."""
         elevation = self.elevation or (-0.5 * np.pi, 0.5 * np.pi)
         return Sector(self.radius, self.inner, self.direction, self.width, elevation if dimensions == 3 else None)
+
+    def extent(self, dimensions: int) -> float:  # noqa: ARG002
+        """Diameter of the disc that it is a part of [m]."""
+        return 2.0 * self.radius
 
 
 FieldOfViewConfig: TypeAlias = Annotated[

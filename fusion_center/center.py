@@ -16,6 +16,7 @@ import numpy as np
 from common.config import Scenario
 from common.estimation.batch import take
 from common.estimation.gaussian import Gaussian
+from common.estimation.pose import SensorPose
 from common.estimation.sprt import DELETED
 from common.fusion_config import FusionConfig
 from common.messages import (
@@ -36,6 +37,7 @@ from common.messages import (
 from common.quantities import NS_PER_S
 from fusion_center.factors import Fuser
 from fusion_center.initiation import Initiation, Unclaimed
+from fusion_center.life import Life
 from fusion_center.picture import Picture, corrections, fused, shown
 from fusion_center.refusal import Refusal
 from fusion_center.selected import SelectedFuser
@@ -67,7 +69,9 @@ class Center:
         fusion: hold-back, window, feedback.
         fuser: moves the picture.
         hypotheses: the tracks given by the scenario, as a picture.
+        life: tests the tracks, and ends those that nobody sees.
         initiation: how further tracks start; None: they do not.
+        poses: of the sensors at first.
         epoch_ns: the instant of scenario time 0.
         speed: seconds of measurement time per second, 0: lockstep.
         wait_ns: how long to wait for the others, once a sensor has joined, before the clock starts.
@@ -79,7 +83,9 @@ class Center:
     fusion: FusionConfig
     fuser: AnyFuser
     hypotheses: Picture
+    life: Life
     initiation: Initiation | None
+    poses: tuple[SensorPose, ...]
     epoch_ns: int
     speed: float
     wait_ns: int
@@ -95,7 +101,9 @@ class Center:
             fusion=scenario.fusion,
             fuser=fuser,
             hypotheses=given(scenario, fuser),
+            life=Life.of(scenario),
             initiation=Initiation.of(scenario),
+            poses=tuple(sensor.pose(scenario.motion.dimensions) for sensor in scenario.sensors),
             epoch_ns=scenario.epoch_ns,
             speed=speed,
             wait_ns=round(wait_s * NS_PER_S),
@@ -115,6 +123,7 @@ class Center:
             history=(),
             counts=Counts(),
             next_id=len(self.hypotheses.ids),
+            base_poses=self.poses,
         )
 
     def step(self, state: State, event: Event, now_ns: int) -> tuple[State, list[Message]]:
@@ -333,15 +342,23 @@ class Center:
             expected = self.fuser.expect(self.fuser.rebased(state.picture, then, rebase), time_ns)
         # A node that has not followed yet speaks of factors that are no more.
         heard = {number: heard for number, heard in reports.items() if heard.lineage == lineage}
-        picture, decisions = self.fuser.advance(expected, heard)
+        poses = self._poses(state, reports)
+        picture, decisions = self.life.judge(self.fuser.advance(expected, heard), time_ns, poses)
+        pairs = state.pairs
         if self.initiation is not None:
-            picture, merged = self.initiation.merged(picture)
+            picture, pairs, merged = self.initiation.merged(state.picture, picture, pairs)
             decisions += merged
             begun = begun or self._seeds(state, self.initiation, picture, reports)
             picture = self.fuser.begin(picture, begun.ids, np.full(len(begun.ids), time_ns), begun.density)
             state = state._replace(next_id=max([state.next_id, *(begun.ids + 1).tolist()]))
-        checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), begun, lineage)
+        checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), begun, lineage, poses, pairs)
         return state._replace(history=(*state.history, checkpoint))
+
+    @staticmethod
+    def _poses(state: State, reports: Mapping[int, AnyHeard]) -> tuple[SensorPose, ...]:
+        """Of each sensor at its last scan."""
+        told = {number: heard.report.pose for number, heard in reports.items() if len(heard.report.position)}
+        return tuple(told.get(number, pose) for number, pose in enumerate(state.poses))
 
     def _seeds(self, state: State, initiation: Initiation, picture: Picture, reports: Mapping[int, AnyHeard]) -> Begun:
         """The tracks that begin at the measurement time of a picture (theory.md §8)."""
@@ -360,7 +377,7 @@ class Center:
         begun = state.history[-1].begun
         if begun is None:
             return []
-        ended = np.unique([decision.track for decision in decisions if decision.kind in ("deleted", "merged")])
+        ended = np.unique([decision.track for decision in decisions if decision.kind in ("deleted", "lost", "merged")])
         if not len(begun.ids) and not len(ended) and self.speed > 0.0:
             return []
         times_ns = np.full(len(begun.ids), state.time_ns)
@@ -438,7 +455,14 @@ class Center:
             for rebase, then in state.told
             if rebase.epoch == base.lineage or rebase.after_ns > base.time_ns - self._window_ns
         )
-        state = state._replace(base=base.picture, base_ns=base.time_ns, base_lineage=base.lineage, told=told)
+        state = state._replace(
+            base=base.picture,
+            base_ns=base.time_ns,
+            base_lineage=base.lineage,
+            base_poses=base.poses,
+            base_pairs=base.pairs,
+            told=told,
+        )
         deleted = [checkpoint.picture.ids[checkpoint.picture.status == DELETED] for checkpoint in gone]
         ids = np.unique(np.concatenate(deleted))
         if not len(ids):

@@ -27,11 +27,11 @@ from common.estimation.motion import Motion
 from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
-from common.estimation.sprt import DELETED, TENTATIVE, Thresholds
+from common.estimation.sprt import DELETED, TENTATIVE, Existence, survive
 from common.limits import MAX_ESTIMATE
-from common.messages import Decision, IntArray, Picked, Rebase, Report
+from common.messages import IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
-from fusion_center.picture import Backup, Picture, common, decided
+from fusion_center.picture import Backup, Picture, common
 from fusion_center.refusal import Refusal
 
 
@@ -114,6 +114,7 @@ class Reported(NamedTuple):
         log_a: relative weights of the terms, shape (T, S, K); where nothing was reported, the last ones.
         P: of the factors, shape (T, S, K, n, n); where nothing was reported, of the predicted ones.
         factors: the same, taken apart.
+        supported: which tracks a plot of any sensor supported, shape (T,).
     """
 
     who: BoolArray
@@ -121,6 +122,7 @@ class Reported(NamedTuple):
     log_a: Array
     P: Array
     factors: Whitened
+    supported: BoolArray
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,7 @@ class Fuser:
         sensors: models of the sensors, in the order of the scenario.
         share: a sensor's share of prior and process noise.
         terms: most terms of a factor.
-        limits: thresholds of the test, or None: nothing is decided.
+        stay_s: mean time that targets stay [s].
         globalised: predict as ``dkf`` does.
     """
 
@@ -140,7 +142,7 @@ class Fuser:
     sensors: tuple[Sensor, ...]
     share: Share
     terms: int
-    limits: Thresholds | None
+    stay_s: float
     globalised: bool
 
     @classmethod
@@ -152,7 +154,7 @@ class Fuser:
             sensors=tuple(sensor.build(motion) for sensor in scenario.sensors),
             share=scenario.share,
             terms=len(motion.models) if isinstance(motion, Imm) else scenario.fusion.terms,
-            limits=scenario.decision.thresholds if scenario.decision.enabled else None,
+            stay_s=scenario.stay,
             globalised=scenario.fusion.mode == "dkf",
         )
 
@@ -170,11 +172,14 @@ class Fuser:
             status=np.empty(0, np.uint8),
             scans=ints,
             log_lr=floats,
+            log_left=floats,
             log_lr_total=floats,
             log_p_bar=per_sensor,
             log_a=np.empty((0, n_sensors, self.terms)),
             reported=per_sensor.astype(np.bool_),
             contributing=per_sensor.astype(np.bool_),
+            supported_ns=ints,
+            coasting=np.empty(0, np.bool_),
             x=np.empty((0, n_sensors, self.terms, n)),
             P=np.empty((0, n_sensors, self.terms, n, n)),
             fused_x=np.empty((0, n)),
@@ -230,11 +235,14 @@ class Fuser:
             status=np.full(tracks, TENTATIVE, np.uint8),
             scans=np.zeros(tracks, np.int64),
             log_lr=np.zeros(tracks),
+            log_left=np.full(tracks, -np.inf),
             log_lr_total=np.zeros(tracks),
             log_p_bar=np.zeros((tracks, n_sensors)),
             log_a=log_a,
             reported=np.zeros((tracks, n_sensors), np.bool_),
             contributing=np.zeros((tracks, n_sensors), np.bool_),
+            supported_ns=times_ns,
+            coasting=np.zeros(tracks, np.bool_),
             x=x,
             P=P,
             fused_x=priors.x,
@@ -301,7 +309,7 @@ class Fuser:
         product = multiply_mixtures(log_a, whitened)
         return Expected(picture, t_ns, kept, live, moving, log_a, factors, whitened, product, network_P)
 
-    def advance(self, expected: Expected, reports: Mapping[int, Heard]) -> tuple[Picture, list[Decision]]:
+    def advance(self, expected: Expected, reports: Mapping[int, Heard]) -> Picture:
         """Work in all reports of one measurement time.
 
         A sensor that is silent, or does not report a track, keeps its factor there, predicted, with p_bar = 1.
@@ -311,11 +319,10 @@ class Fuser:
             reports: by number of the sensor.
 
         Returns:
-            the picture at the measurement time and what was decided.
+            the picture at the measurement time.
         """
         moved = self._move(expected, reports)
-        moved, decisions = decided(moved, self.limits)
-        return (moved if expected.live.all() else put(expected.kept, expected.live, moved)), decisions
+        return moved if expected.live.all() else put(expected.kept, expected.live, moved)
 
     def _move(self, expected: Expected, reports: Mapping[int, Heard]) -> Picture:
         picture, before = expected.moving, expected.product
@@ -328,15 +335,19 @@ class Fuser:
         # A track that nobody reported stays as it is, to the last digit.
         step = np.where(heard, log_lambda(before, after, evidence), 0.0)
         network_P = self._shrunk(expected.network_P, reports) if self.globalised else expected.network_P
+        elapsed_s = (expected.t_ns - picture.times_ns) / NS_PER_S
+        existence = survive(Existence(picture.log_lr, picture.log_left), elapsed_s, self.stay_s)
         return picture._replace(
             times_ns=np.full_like(picture.times_ns, expected.t_ns),
             scans=picture.scans + heard,
-            log_lr=picture.log_lr + step,
+            log_lr=existence.log_lr + step,
+            log_left=existence.log_left,
             log_lr_total=picture.log_lr_total + step,
             log_p_bar=said.log_p_bar,
             log_a=said.log_a,
             reported=picture.reported | said.who,
             contributing=said.who,
+            supported_ns=np.where(said.supported, expected.t_ns, picture.supported_ns),
             x=said.factors.x,
             P=said.P,
             fused_x=after.density.x,
@@ -393,6 +404,7 @@ def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
     picture = expected.moving
     who, log_p_bar, log_a = np.zeros(picture.reported.shape, np.bool_), picture.log_p_bar.copy(), expected.log_a.copy()
     P, factors = expected.factors.P.copy(), Whitened(*(array.copy() for array in expected.whitened))
+    supported = np.zeros(len(picture.ids), np.bool_)
     for number, heard in reports.items():
         rows, others = common(picture.ids, heard.report.ids)
         who[rows, number] = True
@@ -402,4 +414,6 @@ def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:
         P[rows, number, :size] = heard.P[others]
         for array, new in zip(factors, heard.factors, strict=True):
             array[rows, number, :size] = new[others]
-    return Reported(who, log_p_bar, log_a, P, factors)
+        if len(heard.report.supported):
+            supported[rows] |= heard.report.supported[others]
+    return Reported(who, log_p_bar, log_a, P, factors, supported)

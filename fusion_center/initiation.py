@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -16,12 +16,13 @@ from common.estimation.initiation import apart, from_plots, with_second
 from common.estimation.motion import Motion
 from common.estimation.pose import SensorPose
 from common.estimation.sensing import Measurement, Sensor
-from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE
+from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds
 from common.initiation_config import InitiationConfig
 from common.limits import MAX_VALUE, PlotLimits, is_possible
 from common.messages import Decision, IntArray, Picked, Report
 from common.quantities import NS_PER_S
-from fusion_center.picture import Picture
+from fusion_center.life import decision_of
+from fusion_center.picture import Picture, common
 from fusion_center.refusal import Refusal
 
 
@@ -48,6 +49,12 @@ class Unclaimed(NamedTuple):
         return cls(report.time_ns, number, report.pose, report.ids, report.unclaimed)
 
 
+#: Two tracks have parted when their squared distance is so many times that at which they were close.
+_PARTED = 4.0
+#: Log LR of two targets against one, of confirmed tracks that are close to each other, by their ids, ascending.
+Pairs: TypeAlias = Mapping[tuple[int, int], float]
+
+
 class Duplicate(NamedTuple):
     """A track that is another one."""
 
@@ -64,12 +71,14 @@ class Initiation:
         motion: how targets move.
         sensors: models of the sensors.
         limits: of their plots.
+        thresholds: of the test whether two confirmed tracks are one; None: they are, once they are close.
     """
 
     config: InitiationConfig
     motion: Motion
     sensors: tuple[Sensor, ...]
     limits: tuple[PlotLimits, ...]
+    thresholds: Thresholds | None
 
     @classmethod
     def of(cls, scenario: Scenario) -> Initiation | None:
@@ -78,10 +87,12 @@ class Initiation:
             return None
         motion = scenario.motion.build()
         return cls(
-            scenario.initiation,
-            motion,
-            tuple(sensor.build(motion) for sensor in scenario.sensors),
-            tuple(sensor.limits for sensor in scenario.sensors),
+            config=scenario.initiation,
+            motion=motion,
+            sensors=tuple(sensor.build(motion) for sensor in scenario.sensors),
+            limits=tuple(sensor.limits for sensor in scenario.sensors),
+            # Of tracks that do not share plots jointly each explains all plots, as if the other were not there.
+            thresholds=scenario.decision.thresholds if scenario.joint else None,
         )
 
     def fault(self, report: Report | Picked, number: int) -> Refusal | None:
@@ -118,44 +129,80 @@ class Initiation:
                 found = self._apart(found, more, _live(picture, scan.ids))
         return Gaussian(found.x[:room], found.P[:room])
 
-    def merged(self, picture: Picture) -> tuple[Picture, list[Decision]]:
-        """The picture without tracks that are another one, and what was decided so."""
-        duplicates = self.duplicates(picture)
+    def merged(self, before: Picture, picture: Picture, pairs: Pairs) -> tuple[Picture, Pairs, list[Decision]]:
+        """The picture without tracks that are another one.
+
+        Args:
+            before: the picture before the newest data.
+            picture: after it.
+            pairs: of confirmed tracks that were close to each other before.
+
+        Returns:
+            the picture, the pairs that are close now, and what was decided.
+        """
+        duplicates, pairs = self.duplicates(before, picture, pairs)
+        if not duplicates:
+            return picture, pairs, []
         status = picture.status.copy()
         status[[duplicate.row for duplicate in duplicates]] = DELETED
-        decisions = [
-            Decision(
-                kind="merged",
-                track=int(picture.ids[row]),
-                time_ns=int(picture.times_ns[row]),
-                log_lr=float(picture.log_lr[row]),
-                log_lr_total=float(picture.log_lr_total[row]),
-                scans=int(picture.scans[row]),
-                into=int(picture.ids[into]),
-            )
-            for row, into in duplicates
-        ]
-        return picture._replace(status=status), decisions
+        decisions = [decision_of("merged", picture, row, int(picture.ids[into])) for row, into in duplicates]
+        return picture._replace(status=status), pairs, decisions
 
-    def duplicates(self, picture: Picture) -> list[Duplicate]:
-        """Tracks of one target, the weaker of each two: not confirmed, of less LR, younger."""
+    def duplicates(self, before: Picture, picture: Picture, pairs: Pairs) -> tuple[list[Duplicate], Pairs]:
+        """Tracks of one target, the weaker of each two: not confirmed, coasting, of less LR, younger.
+
+        A tentative track is given up as soon as it is close to another one. Of two confirmed ones a sequential test
+        decides: is it more probable that both have a target than that one of them has it (theory.md §8)? Arguments
+        and returns are those of ``merged``.
+        """
+        one, other, distance = self._near(picture)
+        if not len(one):
+            return [], {}
+        confirmed = picture.status == CONFIRMED
+        tested = confirmed[one] & confirmed[other] & (self.thresholds is not None)
+        same = ~tested & (distance < self.config.merge)
+        close: dict[tuple[int, int], float] = {}
+        if tested.any():
+            gain = _gained(before, picture)
+            for place in np.flatnonzero(tested).tolist():
+                first, second = int(one[place]), int(other[place])
+                key = (int(picture.ids[first]), int(picture.ids[second]))
+                if key in pairs or distance[place] < self.config.merge:
+                    log_lr = pairs.get(key, 0.0) + float(min(gain[first], gain[second]))
+                    same[place], close[key] = self._tested(log_lr)
+        rank = np.lexsort((-picture.ids, picture.log_lr_total, confirmed & ~picture.coasting, confirmed))
+        strength = np.empty(len(rank), np.intp)
+        strength[rank] = np.arange(len(rank))
+        return list(_merged(np.stack([one[same], other[same]], axis=1), strength)), close
+
+    def _tested(self, log_lr: float) -> tuple[bool, float]:
+        """Whether two tracks are one, and the log LR to go on with: the test begins anew when they are two."""
+        assert self.thresholds is not None
+        log_a = self.thresholds.log_a if self.thresholds.log_a_kept is None else self.thresholds.log_a_kept
+        return log_lr < log_a, 0.0 if log_lr > self.thresholds.log_b else log_lr
+
+    def _near(self, picture: Picture) -> tuple[IntArray, IntArray, Array]:
+        """Pairs of tracks that are close to each other, or were before they parted a little.
+
+        Returns:
+            rows of the tracks, in each pair the older one first, and squared Mahalanobis distances of their states.
+        """
         rows = np.nonzero((picture.status != DELETED) & (picture.scans > 0))[0]
         if len(rows) < 2 or self.config.merge == 0.0:
-            return []
+            return rows[:0], rows[:0], np.empty(0)
         d = self.motion.dimensions
         x, P = picture.fused_x[rows], picture.fused_P[rows]
-        reach = np.sqrt(2.0 * self.config.merge * P.diagonal(axis1=-2, axis2=-1)[:, :d])
-        near = inside_boxes(x[:, :d], x[:, :d], reach)
+        limit = _PARTED * self.config.merge
+        reach = np.sqrt(2.0 * limit * P.diagonal(axis1=-2, axis2=-1)[:, :d])
+        boxes = inside_boxes(x[:, :d], x[:, :d], reach)
         # Whichever of two is the wider one has the other in its box.
-        one, at = np.nonzero(near.valid)
-        other = near.which[one, at]
+        one, at = np.nonzero(boxes.valid)
+        other = boxes.which[one, at]
         pairs = np.unique(np.sort(np.stack([one, other], axis=1)[one != other], axis=1), axis=0)
         one, other = pairs.T
-        same = quadratic(x[one] - x[other], P[one] + P[other])[0] < self.config.merge
-        rank = np.lexsort((-picture.ids[rows], picture.log_lr_total[rows], picture.status[rows] == CONFIRMED))
-        strength = np.empty(len(rows), np.intp)
-        strength[rank] = np.arange(len(rows))
-        return list(_merged(pairs[same], strength, rows))
+        distance = quadratic(x[one] - x[other], P[one] + P[other])[0]
+        near = distance < limit
+        return rows[one[near]], rows[other[near]], distance[near]
 
     def _single(self, scan: Unclaimed) -> Gaussian:
         density = self._from_plots(scan)
@@ -217,7 +264,16 @@ def _live(picture: Picture, known: IntArray) -> Gaussian:
     return Gaussian(picture.fused_x[others], picture.fused_P[others])
 
 
-def _merged(pairs: IntArray, strength: IntArray, rows: IntArray) -> Iterator[Duplicate]:
+def _gained(before: Picture, picture: Picture) -> Array:
+    """The newest log Lambda of every track of a picture, shape (T,)."""
+    gain = picture.log_lr_total.copy()
+    rows, others = common(picture.ids, before.ids)
+    with np.errstate(invalid="ignore"):  # what was impossible stays so
+        gain[rows] -= before.log_lr_total[others]
+    return np.nan_to_num(gain, nan=0.0, neginf=-np.inf)
+
+
+def _merged(pairs: IntArray, strength: IntArray) -> Iterator[Duplicate]:
     """The weaker tracks of pairs, each going into a stronger one that stays."""
     gone: set[int] = set()
     by_strength = sorted(pairs.tolist(), key=lambda pair: -max(strength[pair[0]], strength[pair[1]]))
@@ -225,4 +281,4 @@ def _merged(pairs: IntArray, strength: IntArray, rows: IntArray) -> Iterator[Dup
         weak, strong = sorted(pair, key=lambda row: strength[row])
         if weak not in gone and strong not in gone:
             gone.add(weak)
-            yield Duplicate(int(rows[weak]), int(rows[strong]))
+            yield Duplicate(weak, strong)

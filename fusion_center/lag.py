@@ -88,6 +88,7 @@ class FixedLag:
             log_lr_total=tracks.log_lr_total[rows],
             x=later.x[: len(ids)],
             P=later.P[: len(ids)],
+            supported_ns=tracks.supported_ns[rows],
         )
 
     def _moved(self, interval_ns: int) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from common.estimation.batch import take
 from common.estimation.gaussian import Array, BoolArray
-from common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
+from common.estimation.sprt import COASTING, DELETED, StatusArray
 from common.messages import Decision, IntArray, Tracks
 
 
@@ -22,13 +22,16 @@ class Picture(NamedTuple):
         times_ns: of the factors: the start, then the newest measurement time, shape (T,).
         status: shape (T,).
         scans: measurement times used, shape (T,).
-        log_lr: since the last reset, shape (T,).
-        log_lr_total: since the start, shape (T,).
+        log_lr: of the test (theory.md §7), shape (T,).
+        log_left: where targets may leave, log LR that the target was there and has left; else -inf, shape (T,).
+        log_lr_total: the sum of all log Lambda since the start, shape (T,).
         log_p_bar: cumulative, as last reported, of all terms of a factor, shape (T, S).
         log_a: relative weights of the terms, shape (T, S, K); -inf is no term.
         reported: which sensors' factors are no more the prior predicted: they reported the track, or were rebased,
             shape (T, S).
         contributing: which sensors reported it at the newest time, shape (T, S).
+        supported_ns: time of the last scan with a plot that was the track's, the start at first, shape (T,).
+        coasting: confirmed, but without such a plot for too long, shape (T,).
         x, P: terms of the factors, shapes (T, S, K, n), (T, S, K, n, n).
         fused_x, fused_P: the product (Eq. 9), shapes (T, n), (T, n, n).
         network_P: for ``dkf``, the covariances that follow from the models alone, shape (T, S, n, n); otherwise S = 0.
@@ -42,11 +45,14 @@ class Picture(NamedTuple):
     status: StatusArray
     scans: IntArray
     log_lr: Array
+    log_left: Array
     log_lr_total: Array
     log_p_bar: Array
     log_a: Array
     reported: BoolArray
     contributing: BoolArray
+    supported_ns: IntArray
+    coasting: BoolArray
     x: Array
     P: Array
     fused_x: Array
@@ -70,26 +76,6 @@ class Backup(NamedTuple):
     P: Array
     x_a: Array
     P_a: Array
-
-
-def decided(picture: Picture, limits: Thresholds | None) -> tuple[Picture, list[Decision]]:
-    """The picture after the test of every track, and what was decided; without limits nothing is."""
-    if limits is None:
-        return picture, []
-    verdict = decide(picture.log_lr, picture.status, limits)
-    # Confirmed anew, a track only has its LR reset: that is monitoring, not a decision.
-    decisions = [
-        Decision(
-            kind="deleted" if verdict.rejected[row] else "confirmed",
-            track=int(picture.ids[row]),
-            time_ns=int(picture.times_ns[row]),
-            log_lr=float(picture.log_lr[row]),
-            log_lr_total=float(picture.log_lr_total[row]),
-            scans=int(picture.scans[row]),
-        )
-        for row in np.nonzero(verdict.status != picture.status)[0]
-    ]
-    return picture._replace(log_lr=verdict.log_lr, status=verdict.status), decisions
 
 
 def corrections(before: list[Decision], after: list[Decision]) -> list[Decision]:
@@ -117,13 +103,14 @@ def shown(picture: Picture, time_ns: int, names: tuple[str, ...]) -> Tracks:
         time_ns=time_ns,
         sensors=names,
         ids=picture.ids,
-        status=picture.status,
+        status=np.where(picture.coasting & (picture.status != DELETED), COASTING, picture.status),
         scans=picture.scans,
         contributing=picture.contributing,
         log_lr=picture.log_lr,
         log_lr_total=picture.log_lr_total,
         x=picture.fused_x,
         P=picture.fused_P,
+        supported_ns=picture.supported_ns,
     )
 
 

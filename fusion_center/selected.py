@@ -16,12 +16,12 @@ from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, 
 from common.estimation.mixture import Mixture
 from common.estimation.pose import SensorPose
 from common.estimation.sensing import Sensor
-from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds
+from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Existence, survive
 from common.limits import is_possible
 from common.local_filter import SUREST, LocalFilter
-from common.messages import Decision, IntArray, Picked, Rebase, Report
+from common.messages import IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
-from fusion_center.picture import Backup, Picture, common, decided
+from fusion_center.picture import Backup, Picture, common
 from fusion_center.refusal import Refusal
 
 
@@ -84,13 +84,17 @@ class SelectedFuser:
     Attributes:
         filter: predicts and filters the tracks.
         sensors: as the scenario describes them, and their models.
-        limits: thresholds of the test, or None: nothing is decided.
+        stay_s: mean time that targets stay [s].
+        gained: log LR that a confirmed track has beyond ``log_lr``: what a reset at its confirmation took away.
+        supporting: it is kept when a plot supported a track.
         joint: tracks that share plots are associated jointly (Eq. 21).
     """
 
     filter: LocalFilter
     sensors: tuple[tuple[SensorConfig, Sensor], ...]
-    limits: Thresholds | None
+    stay_s: float
+    gained: float
+    supporting: bool
     joint: bool
 
     @classmethod
@@ -100,7 +104,9 @@ class SelectedFuser:
         return cls(
             filter=local,
             sensors=tuple((config, config.build(local.motion)) for config in scenario.sensors),
-            limits=scenario.decision.thresholds if scenario.decision.enabled else None,
+            stay_s=scenario.stay,
+            gained=scenario.decision.thresholds.log_b if scenario.decision.enabled and scenario.life is None else 0.0,
+            supporting=scenario.life is not None,
             joint=scenario.joint,
         )
 
@@ -129,11 +135,14 @@ class SelectedFuser:
             status=np.full(tracks, TENTATIVE, np.uint8),
             scans=np.zeros(tracks, np.int64),
             log_lr=zero,
+            log_left=np.full(tracks, -np.inf),
             log_lr_total=zero,
             log_p_bar=np.zeros((tracks, 1)),
             log_a=log_w[:, None],
             reported=nobody,
             contributing=nobody,
+            supported_ns=times_ns,
+            coasting=np.zeros(tracks, np.bool_),
             x=x[0][:, None],
             P=P[0][:, None],
             fused_x=priors.x,
@@ -177,7 +186,7 @@ class SelectedFuser:
         mixture = Mixture(log_w, log_w, Gaussian(moving.x[None, :, 0], moving.P[None, :, 0]))
         return ExpectedTracks(picture, t_ns, kept, live, moving, self.filter.predict(mixture, dt))
 
-    def advance(self, expected: ExpectedTracks, reports: Mapping[int, HeardPlots]) -> tuple[Picture, list[Decision]]:
+    def advance(self, expected: ExpectedTracks, reports: Mapping[int, HeardPlots]) -> Picture:
         """Work in all reports of one measurement time, sensor after sensor.
 
         Args:
@@ -185,11 +194,11 @@ class SelectedFuser:
             reports: by number of the sensor.
 
         Returns:
-            the picture at the measurement time and what was decided.
+            the picture at the measurement time.
         """
         picture, mixture = expected.moving, expected.mixture
         existence = self._existence(picture)
-        who = np.zeros(picture.reported.shape, np.bool_)
+        who, supported = np.zeros(picture.reported.shape, np.bool_), np.zeros(len(picture.ids), np.bool_)
         for number in sorted(reports):
             report, plots, _ = reports[number]
             rows, others = common(picture.ids, report.ids)
@@ -197,57 +206,68 @@ class SelectedFuser:
             assert plots.valid is not None and plots.number is not None
             theirs = Plots(plots.z[others], plots.valid[others], number=plots.number[others])
             seen = _Seen(number, report.pose, theirs, len(report.z), existence[rows])
-            mixture = self._filtered(mixture, rows, seen)
+            mixture, by_this = self._filtered(mixture, rows, seen)
+            supported[rows] |= by_this
         # Weights start each time with sum one, so their sum is the evidence of this time alone.
         step = log_sum_exp(mixture.log_g)
         x, P = mixture.density.x[0], mixture.density.P[0]
         fused = moments(np.exp(mixture.log_w), Gaussian(x, P))
+        elapsed_s = (expected.t_ns - picture.times_ns) / NS_PER_S
+        survived = survive(Existence(picture.log_lr, picture.log_left), elapsed_s, self.stay_s)
         moved = picture._replace(
             times_ns=np.full_like(picture.times_ns, expected.t_ns),
             scans=picture.scans + who.any(axis=-1),
-            log_lr=picture.log_lr + step,
+            log_lr=survived.log_lr + step,
+            log_left=survived.log_left,
             log_lr_total=picture.log_lr_total + step,
             log_a=mixture.log_w[:, None],
             reported=picture.reported | who,
             contributing=who,
+            supported_ns=np.where(supported, expected.t_ns, picture.supported_ns),
             x=x[:, None],
             P=P[:, None],
             fused_x=fused.x,
             fused_P=fused.P,
         )
-        moved, decisions = decided(moved, self.limits)
         if expected.live.all():
-            return moved, decisions
+            return moved
         kept, moved = _alike(expected.kept, moved)
-        return put(kept, expected.live, moved), decisions
+        return put(kept, expected.live, moved)
 
     def _existence(self, picture: Picture) -> Array:
-        """Probability of the tracks to exist; confirmation, which begins log LR anew, has gained log B."""
-        gained = 0.0 if self.limits is None else self.limits.log_b
-        odds = picture.log_lr + np.where(picture.status == CONFIRMED, gained, 0.0)
+        """Probability of the tracks to exist."""
+        odds = Existence(picture.log_lr, picture.log_left).log_odds
+        odds = odds + np.where(picture.status == CONFIRMED, self.gained, 0.0)
         existence: Array = expit(np.clip(odds, -SUREST, SUREST))
         return existence
 
-    def _filtered(self, mixture: Mixture, rows: IntArray | slice, seen: _Seen) -> Mixture:
-        """The mixtures after a scan of one sensor; tracks that it does not know stay as they are."""
+    def _filtered(self, mixture: Mixture, rows: IntArray | slice, seen: _Seen) -> tuple[Mixture, BoolArray]:
+        """The mixtures after a scan of one sensor; tracks that it does not know stay as they are.
+
+        Returns:
+            all tracks; and which of those in ``rows`` a plot supported.
+        """
         config, sensor = self.sensors[seen.number]
         sensor, stand = sensor.at(seen.pose), seen.pose.position
         density = Gaussian(*(part[:, rows] for part in mixture.density))
         mine = Mixture(mixture.log_w[rows], mixture.log_g[rows], density)
         expected = self.filter.expect(mine.density, sensor, stand, config.view_center(stand))
         near = self.filter.near(expected, seen.plots, sensor, stand)
+        supported = np.zeros(len(mine.log_w), np.bool_)
+        if self.supporting:
+            supported = self.filter.supported(mine, expected, near, sensor, stand)
         if self.joint and len(seen.existence) > 1:
             near, _ = self.filter.shared(mine, expected, near, seen.many, sensor, stand, seen.existence)
         mine = self.filter.update(mine, expected, near, sensor, stand)
         if isinstance(rows, slice):
-            return mine
+            return mine, supported
         size = max(mixture.log_w.shape[1], mine.log_w.shape[1])
         whole, part = _wide(mixture, size), _wide(mine, size)
         for old, new in zip(whole[:2], part[:2], strict=True):
             old[rows] = new
         for old, new in zip(whole.density, part.density, strict=True):
             old[:, rows] = new
-        return whole
+        return whole, supported
 
 
 def _with_plots(report: Picked, usable: BoolArray) -> Picked:

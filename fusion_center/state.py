@@ -7,8 +7,10 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from common.estimation.gaussian import Gaussian
+from common.estimation.pose import SensorPose
 from common.messages import NEVER, Clock, Decision, IntArray, Join, Picked, Rebase, Report
 from fusion_center.factors import Expected, Heard
+from fusion_center.initiation import Pairs
 from fusion_center.picture import Backup, Picture
 from fusion_center.refusal import Refusal, Refused, add
 from fusion_center.selected import ExpectedTracks, HeardPlots
@@ -59,7 +61,7 @@ class AnyFuser(Protocol):
         """Work out what a picture will be at a measurement time, as far as no report is needed for it."""
         ...
 
-    def advance(self, expected: Any, reports: Mapping[int, Any]) -> tuple[Picture, list[Decision]]:
+    def advance(self, expected: Any, reports: Mapping[int, Any]) -> Picture:
         """Work in all reports of one measurement time."""
         ...
 
@@ -106,6 +108,8 @@ class Checkpoint(NamedTuple):
         decisions: made then.
         begun: tracks that began then; None: none ever do.
         lineage: epoch of the rebase that the factors of the picture descend from; 0: none.
+        poses: of each sensor at its last scan.
+        pairs: log LR of two targets against one, of confirmed tracks that are close to each other, by their ids.
     """
 
     time_ns: int
@@ -114,6 +118,8 @@ class Checkpoint(NamedTuple):
     decisions: tuple[Decision, ...]
     begun: Begun | None = None
     lineage: int = 0
+    poses: tuple[SensorPose, ...] = ()
+    pairs: Pairs = MappingProxyType({})
 
 
 class Told(NamedTuple):
@@ -172,6 +178,8 @@ class State(NamedTuple):
         base: the picture before the oldest checkpoint.
         base_ns: its time.
         base_lineage: its lineage.
+        base_poses: its poses.
+        base_pairs: its pairs.
         history: checkpoints inside the window, oldest first.
         counts: of reports.
         refused: how often each sensor was refused for each reason; the sum is ``counts.refused``.
@@ -190,6 +198,8 @@ class State(NamedTuple):
     counts: Counts
     refused: Refused = MappingProxyType({})
     base_lineage: int = 0
+    base_poses: tuple[SensorPose, ...] = ()
+    base_pairs: Pairs = MappingProxyType({})
     told: tuple[Told, ...] = ()
     next_id: int = 0
     expected: AnyExpected | None = None
@@ -203,6 +213,16 @@ class State(NamedTuple):
     def lineage(self) -> int:
         """Epoch of the rebase that the newest factors descend from."""
         return self.history[-1].lineage if self.history else self.base_lineage
+
+    @property
+    def poses(self) -> tuple[SensorPose, ...]:
+        """Of each sensor at its last scan."""
+        return self.history[-1].poses if self.history else self.base_poses
+
+    @property
+    def pairs(self) -> Pairs:
+        """Log LR of two targets against one, of confirmed tracks that are close to each other."""
+        return self.history[-1].pairs if self.history else self.base_pairs
 
     @property
     def time_ns(self) -> int:

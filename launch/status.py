@@ -20,7 +20,7 @@ from common.messages import Decision, Tracks
 from common.quantities import NS_PER_S
 from studies.lines import decision_text
 
-_STYLE = {Status.TENTATIVE: "yellow", Status.CONFIRMED: "bold green", Status.DELETED: "red"}
+_STYLE = {Status.TENTATIVE: "yellow", Status.CONFIRMED: "bold green", Status.DELETED: "red", Status.COASTING: "cyan"}
 #: What matters most comes first; any other status after the confirmed.
 _RANK = {Status.CONFIRMED: 0, Status.TENTATIVE: 2, Status.DELETED: 3}
 #: Half the width of the bar between log A and log B, at most and at least.

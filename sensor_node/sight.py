@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit, ndtr
@@ -11,12 +12,28 @@ from common.config import Scenario, SensorConfig
 from common.estimation import clutter_map
 from common.estimation.association import Expected, Plots
 from common.estimation.clutter_map import ClutterMap, ClutterModel
-from common.estimation.gaussian import Array
+from common.estimation.gaussian import Array, BoolArray
 from common.estimation.mixture import Mixture
 from common.estimation.pose import SensorPose
 from common.estimation.sensing import Sensor
 from common.local_filter import DOUBT, Left, LocalFilter
 from sensor_node.state import Look, Tracks
+
+
+class Seen(NamedTuple):
+    """Tracks after a scan, and what else the scan tells.
+
+    Attributes:
+        mixture: the tracks.
+        visible: their probabilities to be visible to each sensor, shape (T, S).
+        left: what they leave of the plots; None: not asked for.
+        supported: which tracks a plot supports, shape (T,); not asked for: shape (0,).
+    """
+
+    mixture: Mixture
+    visible: Array
+    left: Left | None
+    supported: BoolArray
 
 
 @dataclass(frozen=True)
@@ -31,6 +48,7 @@ class Sight:
         joint: tracks that share plots are associated jointly (Eq. 21).
         claimed: a plot that belongs to the tracks with at least this probability starts none; None: none does.
         min_speed: targets are faster [m/s].
+        supporting: it is asked which tracks a plot supports.
         dimensions: of space.
     """
 
@@ -41,6 +59,7 @@ class Sight:
     joint: bool
     claimed: float | None
     min_speed: float
+    supporting: bool
     dimensions: int
 
     @classmethod
@@ -56,6 +75,7 @@ class Sight:
             joint=scenario.joint,
             claimed=None if initiation is None or config.kind == "bearing" else initiation.claimed,
             min_speed=0.0 if initiation is None else initiation.min_speed,
+            supporting=scenario.life is not None,
             dimensions=motion.dimensions,
         )
 
@@ -88,8 +108,14 @@ class Sight:
             look: the scan.
             log_odds: of the tracks to exist, shape (T,).
         """
+        near = local.near(expected, look.plots, self.sensor.at(look.pose), look.pose.position)
+        return self._associate(local, predicted, expected, near, look, log_odds)
+
+    def _associate(
+        self, local: LocalFilter, predicted: Mixture, expected: Expected, near: Plots, look: Look, log_odds: Array
+    ) -> tuple[Plots, Left | None]:
+        """``near``, of plots that are near the tracks each by itself."""
         sensor, stand = self.sensor.at(look.pose), look.pose.position
-        near = local.near(expected, look.plots, sensor, stand)
         if look.plots.z.ndim > 2 or not (self.sharing or (self.joint and len(log_odds) > 1)):
             return near, None
         plots, odds = len(look.plots.z), self._told(log_odds)
@@ -124,21 +150,18 @@ class Sight:
         near, _ = self.near(local, predicted, expected, look, log_odds)
         return local.update(predicted, expected, near, self.sensor.at(look.pose), look.pose.position)
 
-    def look(
-        self, local: LocalFilter, tracks: Tracks, predicted: Mixture, expected: Expected, look: Look
-    ) -> tuple[Mixture, Array, Left | None]:
-        """``filter``, and what else the scan tells.
-
-        Returns:
-            the tracks; their probabilities to be visible to each sensor, shape (T, S); and what they leave of the
-            plots, None: not asked for.
-        """
-        near, left = self.near(local, predicted, expected, look, tracks.log_odds)
+    def look(self, local: LocalFilter, tracks: Tracks, predicted: Mixture, expected: Expected, look: Look) -> Seen:
+        """``filter``, and what else the scan tells."""
         visible, sensor, stand = tracks.visible, self.sensor.at(look.pose), look.pose.position
+        by_itself = local.near(expected, look.plots, sensor, stand)
+        near, left = self._associate(local, predicted, expected, by_itself, look, tracks.log_odds)
         if self.sensor.visibility is not None:
             v, visible = visible[:, self.number], visible.copy()
             visible[:, self.number] = local.visible(v, predicted, expected, near, sensor, stand)
-        return local.update(predicted, expected, near, sensor, stand), visible, left
+        supported = np.empty(0, np.bool_)
+        if self.supporting:
+            supported = local.supported(predicted, expected, by_itself, sensor, stand)
+        return Seen(local.update(predicted, expected, near, sensor, stand), visible, left, supported)
 
     def mapped(self, seen: ClutterMap | None, look: Look) -> Look:
         """A scan with the density of false plots that earlier scans tell of."""

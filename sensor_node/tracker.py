@@ -25,8 +25,13 @@ from common.estimation.selection import Selection, select
 from common.local_filter import SUREST, LocalFilter
 from common.messages import NEVER, Advice, Begin, IntArray, Join, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
+<<<<<<< HEAD
 from sensor_node.sight import Sight
 from sensor_node.state import Beliefs, Look, Ready, Schedule, State, Tracks, alike, left, put_tracks, with_before
+=======
+from sensor_node.sight import Seen, Sight
+from sensor_node.state import Look, Ready, Schedule, State, Tracks, alike, left, put_tracks
+>>>>>>> 62ab499 (Tracks have a life: survival, coasting, lost; whether two confirmed tracks are one is a sequential test)
 
 
 @dataclass(frozen=True)
@@ -118,10 +123,12 @@ class LocalTracker:
         sight, state = self.sights[look.number], self._rebased(state, look.time_ns)
         look = sight.mapped(state.maps[look.number], look)
         ready = self._ready(state, look.time_ns, look.pose, look.number)
-        mixture, visible, rest = sight.look(self.filter, ready.predicted, ready.mixture, ready.expected, look)
+        seen = sight.look(self.filter, ready.predicted, ready.mixture, ready.expected, look)
+        mixture, visible, rest, _ = seen
         filtered = self._with(ready.predicted, mixture)._replace(visible=visible)
         maps = tuple(
-            sight.learned(seen, look, rest) if number == look.number else seen for number, seen in enumerate(state.maps)
+            sight.learned(known, look, rest) if number == look.number else known
+            for number, known in enumerate(state.maps)
         )
         look, unclaimed = sight.unclaimed(look, rest)
         tracks = filtered if ready.live.all() else put_tracks(ready.advised, ready.live, filtered)
@@ -130,7 +137,7 @@ class LocalTracker:
         if self.advised:
             look = look._replace(before=self._beliefs(take(ready.advised, ready.live)))
         if self.selection is None:
-            report: Report | Picked = self._report(state, look, next_ns, filtered.ids, mixture, unclaimed)
+            report: Report | Picked = self._report(state, look, next_ns, filtered.ids, seen, unclaimed)
         else:
             report = self._picked(state, look, next_ns, ready, self.selection, unclaimed)
         sequence, recent = state.sequence + 1, (*kept, look)
@@ -165,15 +172,13 @@ class LocalTracker:
             heading=look.pose.heading,
         )
 
-    def _report(
-        self, state: State, look: Look, next_ns: int, ids: IntArray, filtered: Mixture, unclaimed: Array
-    ) -> Report:
-        mixture = self.filter.report(filtered)
+    def _report(self, state: State, look: Look, next_ns: int, ids: IntArray, seen: Seen, unclaimed: Array) -> Report:
+        mixture, sight = self.filter.report(seen.mixture), self.sights[look.number]
         there = mixture.log_w > -np.inf
         x, P = (array[0][there] for array in mixture.density)
-        pose = look.pose if self.sights[look.number].claimed is not None else SensorPose(np.empty(0))
+        pose = look.pose if sight.supporting or sight.claimed is not None else SensorPose(np.empty(0))
         return Report(
-            sensor=self.sights[look.number].config.name,
+            sensor=sight.config.name,
             sequence=state.sequence,
             time_ns=look.time_ns,
             next_ns=next_ns,
@@ -187,6 +192,7 @@ class LocalTracker:
             unclaimed=unclaimed,
             velocity=pose.velocity,
             heading=pose.heading,
+            supported=seen.supported,
         )
 
     def join(self, state: State, incarnation: int, next_ns: int) -> Join:
@@ -273,6 +279,7 @@ class LocalTracker:
         for kept in state.recent:
             look, due = kept if alone else left(kept), fresh.times_ns < kept.time_ns
             if due.any():
+<<<<<<< HEAD
                 part = take(fresh, due)
                 recent.append(with_before(kept, self._beliefs(part)) if self.advised else kept)
                 predicted, mixture, expected = self._expect(part, look.time_ns, look.pose, look.number)
@@ -280,6 +287,11 @@ class LocalTracker:
                 fresh = put_tracks(fresh, due, self._with(predicted, mixture)._replace(visible=visible))
             else:
                 recent.append(kept)
+=======
+                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.pose, look.number)
+                seen = self.sights[look.number].look(self.filter, predicted, mixture, expected, look)
+                fresh = put_tracks(fresh, due, self._with(predicted, seen.mixture)._replace(visible=seen.visible))
+>>>>>>> 62ab499 (Tracks have a life: survival, coasting, lost; whether two confirmed tracks are one is a sequential test)
         tracks = concatenate(*alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
         return state._replace(tracks=tracks, recent=tuple(recent))

@@ -16,13 +16,15 @@ import numpy as np
 from common.config import Scenario
 from common.estimation.batch import take
 from common.estimation.imm import Imm
+from common.estimation.pose import SensorPose
 from common.estimation.sprt import DELETED
 from common.local_filter import HONEST, LocalFilter
 from common.messages import NEVER, Decision, Report, Scan, Start, Stop, Tracks
 from common.quantities import NS_PER_S
 from fusion_center.center import given
 from fusion_center.factors import Fuser, Heard
-from fusion_center.initiation import Initiation, Unclaimed
+from fusion_center.initiation import Initiation, Pairs, Unclaimed
+from fusion_center.life import Life
 from fusion_center.picture import Picture, shown
 from sensor_node.state import Schedule
 from sensor_node.state import State as Filtered
@@ -37,12 +39,16 @@ class State(NamedTuple):
         picture: all tracks, with those to come and those just deleted.
         unclaimed: plots of the last seconds that no track claims, oldest first.
         next_id: of the next track that begins.
+        poses: of each sensor at its last scan.
+        pairs: of confirmed tracks that are close to each other.
     """
 
     filtered: Filtered
     picture: Picture
     unclaimed: tuple[Unclaimed, ...]
     next_id: int
+    poses: tuple[SensorPose, ...]
+    pairs: Pairs
 
 
 @dataclass(frozen=True)
@@ -54,14 +60,18 @@ class Centralised:
         tracker: works in the scans of all of them.
         fuser: of a single factor, which is the track.
         hypotheses: the tracks given by the scenario.
+        life: tests the tracks, and ends those that nobody sees.
         initiation: how further tracks start; None: they do not.
+        poses: of the sensors at first.
     """
 
     names: tuple[str, ...]
     tracker: LocalTracker
     fuser: Fuser
     hypotheses: Picture
+    life: Life
     initiation: Initiation | None
+    poses: tuple[SensorPose, ...]
 
     @classmethod
     def of(cls, scenario: Scenario) -> Centralised:
@@ -76,12 +86,15 @@ class Centralised:
             tracker=replace(tracker, filter=local, rounding=None, selection=None, buffer_ns=0, schedule=None),
             fuser=fuser,
             hypotheses=given(scenario, fuser),
+            life=Life.of(scenario),
             initiation=Initiation.of(scenario),
+            poses=tuple(sensor.pose(scenario.motion.dimensions) for sensor in scenario.sensors),
         )
 
     def initial(self) -> State:
         """Before the first scan."""
-        return State(self.tracker.initial(), self.hypotheses, (), len(self.hypotheses.ids))
+        none: Pairs = {}
+        return State(self.tracker.initial(), self.hypotheses, (), len(self.hypotheses.ids), self.poses, none)
 
     def step(self, state: State, scans: Sequence[Scan]) -> tuple[State, list[Tracks | Decision]]:
         """Work in all scans of one measurement time, one after the other.
@@ -100,12 +113,16 @@ class Centralised:
             assert isinstance(report, Report), "no plots are selected"
             reports.append(report)
         # The last report has the evidence of all, and the tracks after all.
-        expected = self.fuser.expect(state.picture, time_ns)
-        picture, decisions = self.fuser.advance(expected, {0: Heard.of(reports[-1])})
-        state = state._replace(filtered=filtered, picture=picture)
+        expected, before = self.fuser.expect(state.picture, time_ns), state.picture
+        whole = reports[-1]._replace(supported=np.any([report.supported for report in reports], axis=0))
+        moved = self.fuser.advance(expected, {0: Heard.of(whole)})
+        told = {scan.sensor: scan.pose for scan in scans}
+        poses = tuple(told.get(name, pose) for name, pose in zip(self.names, state.poses, strict=True))
+        picture, decisions = self.life.judge(moved, time_ns, poses)
+        state = state._replace(filtered=filtered, picture=picture, poses=poses)
         if self.initiation is not None:
             now = [Unclaimed.of(self.names.index(report.sensor), report) for report in reports]
-            state, merged = self._initiated(state, self.initiation, now)
+            state, merged = self._initiated(before, state, self.initiation, now)
             decisions += merged
         tracks = shown(state.picture, time_ns, self.names)
         scanned = np.isin(self.names, [scan.sensor for scan in scans])
@@ -129,13 +146,14 @@ class Centralised:
         return self.tracker.start(filtered, Start("", filtered.epoch, new.ids, new.starts_ns, zero, *density, *density))
 
     def _initiated(
-        self, state: State, initiation: Initiation, now: Sequence[Unclaimed]
+        self, before: Picture, state: State, initiation: Initiation, now: Sequence[Unclaimed]
     ) -> tuple[State, list[Decision]]:
         """Give up tracks that are another one, and begin those of the plots that none claims (theory.md §8)."""
-        picture, merged = initiation.merged(state.picture)
+        picture, pairs, merged = initiation.merged(before, state.picture, state.pairs)
         density = initiation.seeds(picture, now, state.unclaimed)
         ids, time_ns = state.next_id + np.arange(len(density.x)), now[0].time_ns
         picture = self.fuser.begin(picture, ids, np.full(len(ids), time_ns), density)
         oldest_ns = time_ns - round(initiation.config.within * NS_PER_S)
         kept = (scan for scan in (*state.unclaimed, *now) if scan.time_ns >= oldest_ns)
-        return state._replace(picture=picture, unclaimed=tuple(kept), next_id=state.next_id + len(ids)), merged
+        next_id = state.next_id + len(ids)
+        return state._replace(picture=picture, unclaimed=tuple(kept), next_id=next_id, pairs=pairs), merged

@@ -43,7 +43,7 @@ class TrackLines:
     def by_track(self, tracks: Tracks) -> Iterator[tuple[int, str]]:
         """The lines of one measurement time, each with its track, by track."""
         time_s = self._scenario.to_seconds(tracks.time_ns)
-        entries = dict(zip(tracks.ids.tolist(), _entries(tracks), strict=True))
+        entries = dict(zip(tracks.ids.tolist(), _entries(tracks, self._scenario), strict=True))
         if self._lag is not None:
             self._past, lagged = self._lag.step(self._past, tracks)
             for entry in entries.values():
@@ -57,12 +57,14 @@ class TrackLines:
             yield track, json.dumps({"time": time_s, "track": track, **entry}, allow_nan=False)
 
 
-def _entries(tracks: Tracks) -> Iterator[dict[str, Any]]:
+def _entries(tracks: Tracks, scenario: Scenario) -> Iterator[dict[str, Any]]:
     """What is said of each track."""
     log_lr, total = (np.clip(values, -_LARGEST, _LARGEST) for values in (tracks.log_lr, tracks.log_lr_total))
-    columns = (tracks.status, log_lr, total, tracks.x, tracks.P)
-    for status, *numbers in zip(*(column.tolist() for column in columns), strict=True):
-        yield dict(zip(("status", "log_lr", "log_lr_total", "x", "P"), (_STATUS[status], *numbers), strict=True))
+    columns = (tracks.status, log_lr, total, tracks.x, tracks.P, tracks.supported_ns)
+    names = ("status", "log_lr", "log_lr_total", "x", "P", "supported")
+    for status, *numbers, supported_ns in zip(*(column.tolist() for column in columns), strict=True):
+        supported_s = scenario.to_seconds(supported_ns)
+        yield dict(zip(names, (_STATUS[status], *numbers, supported_s), strict=True))
 
 
 def decision_entry(decision: Decision, scenario: Scenario) -> dict[str, Any]:

@@ -324,9 +324,9 @@ GOLDEN_ADVICE = Advice(
 GOLDEN = [
     (
         GOLDEN_REPORT,
-        "95 03 01"  # version, kind
+        "95 04 01"  # version, kind
         "94 03 0a cf7fffffffffffffff 02"  # sequence, time, next, epoch
-        "96 01 01 02 00 00 00"  # T, N, n, d, U, m
+        "97 01 01 02 00 00 00 00"  # T, N, n, d, U, m, L
         "c4 35 07000000 01"  # bin; ids, terms
         "000000000000e0bf"  # log_g
         "000000000000f03f 0000000000000040"  # x
@@ -334,8 +334,8 @@ GOLDEN = [
     ),
     (
         GOLDEN_UNCLAIMED,
-        "95 03 01 94 03 0a cf7fffffffffffffff 02"  # as before
-        "96 01 01 02 02 01 02"  # T, N, n, d, U, m
+        "95 04 01 94 03 0a cf7fffffffffffffff 02"  # as before
+        "97 01 01 02 02 01 02 00"  # T, N, n, d, U, m, L
         "c4 55 07000000 01 000000000000e0bf 000000000000f03f 0000000000000040"
         "0000000000001040 000000000000f03f 0000000000000840"
         "0000000000001440 0000000000000000"  # position
@@ -343,7 +343,7 @@ GOLDEN = [
     ),
     (
         GOLDEN_PICKED,
-        "95 03 0d 94 03 0a 0c 02"  # version, kind, sequence, time, next, epoch
+        "95 04 0d 94 03 0a 0c 02"  # version, kind, sequence, time, next, epoch
         "96 01 01 01 02 02 01"  # T, N, M, m, d, U
         "c4 38 07000000 0100 0000"  # bin; ids, plots, which
         "000000000000f03f 0000000000000040"  # z
@@ -352,7 +352,7 @@ GOLDEN = [
     ),
     (
         GOLDEN_START,
-        "95 03 04 92 02 09 92 01 02"  # version, kind, epoch, next id, T, n
+        "95 04 04 92 02 09 92 01 02"  # version, kind, epoch, next id, T, n
         "c4 64 07000000 0201000000000000"  # bin; ids, times
         "000000000000e0bf"  # log_p_bar
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840"  # x, P
@@ -360,34 +360,34 @@ GOLDEN = [
     ),
     (
         GOLDEN_BEGIN,
-        "95 03 0b 92 02 0c 93 01 02 02"  # version, kind, epoch, given, T, n, E
+        "95 04 0b 92 02 0c 93 01 02 02"  # version, kind, epoch, given, T, n, E
         "c4 3c 07000000 0201000000000000"  # bin; ids, times
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840"  # x, P
         "05000000 06000000",  # ended
     ),
     (
         GOLDEN_ADVICE,
-        "95 03 06 92 0c 0a 92 01 02"  # version, kind, given, time, T, n
+        "95 04 06 92 0c 0a 92 01 02"  # version, kind, given, time, T, n
         "c4 2c 07000000"  # bin; ids
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840",  # x, P
     ),
     (
         Rebase(5, *GOLDEN_ADVICE),
-        "95 03 0c 93 05 0c 0a 92 01 02"  # version, kind, epoch, given, time, T, n
+        "95 04 0c 93 05 0c 0a 92 01 02"  # version, kind, epoch, given, time, T, n
         "c4 2c 07000000"  # bin; ids
         "000000000000f03f 0000000000000040 0000000000001040 000000000000f03f 0000000000000840",  # x, P
     ),
     (
         Join("a", 1, 10, "0f"),
-        "95 03 03 93 01 0a a2 3066 90 c400",  # version, kind, incarnation, next, digest
+        "95 04 03 93 01 0a a2 3066 90 c400",  # version, kind, incarnation, next, digest
     ),
     (
         Join("a", 1, 10, "0f", 7, 9),
-        "95 03 03 95 01 0a a2 3066 07 09 90 c400",  # epoch and next id of a node that has heard of any
+        "95 04 03 95 01 0a a2 3066 07 09 90 c400",  # epoch and next id of a node that has heard of any
     ),
     (
         Decision("merged", 7, 10, 0.5, 2.0, 12, into=4),
-        "95 03 09 97 a66d6572676564 07 0a"  # version, kind, what, track, time
+        "95 04 09 97 a66d6572676564 07 0a"  # version, kind, what, track, time
         "cb3fe0000000000000 cb4000000000000000 0c 04 90 c400",  # log_lr, log_lr_total, scans, into
     ),
 ]
@@ -397,13 +397,13 @@ GOLDEN = [
 GOLDEN_MOVING = [
     (
         Scan("a", 10, np.array([5.0, 0.0]), np.array([[1.0]]), np.array([2.0, -4.0]), 0.5),
-        "96 03 02 91 0a 93 02 01 01"  # version, kind, time, d, M, m
+        "96 04 02 91 0a 93 02 01 01"  # version, kind, time, d, M, m
         "c4 18 0000000000001440 0000000000000000 000000000000f03f"  # bin; position, z
         "c4 18 0000000000000040 00000000000010c0 000000000000e03f",  # bin; velocity, heading
     ),
     (
         Scan("a", 10, np.array([5.0, 0.0]), np.array([[1.0]]), heading=0.5),
-        "96 03 02 91 0a 93 02 01 01 c4 18 0000000000001440 0000000000000000 000000000000f03f"
+        "96 04 02 91 0a 93 02 01 01 c4 18 0000000000001440 0000000000000000 000000000000f03f"
         "c4 08 000000000000e03f",  # bin; heading
     ),
 ]
@@ -427,7 +427,7 @@ GOLDEN_ROUNDED = [
     (
         GOLDEN_UNCLAIMED,
         POSITIONS,
-        "95 03 0a 94 03 0a cf7fffffffffffffff 02 97 01 01 02 02 01 02 02"
+        "95 04 0a 94 03 0a cf7fffffffffffffff 02 98 01 01 02 02 01 02 02 00"
         "c4 41 07000000 01 000000000000e0bf"  # log_g in full
         "0000803e 00000040 02008040 0000803f 03004040"  # x, P
         "0000000000001440 0000000000000000"  # position in full
@@ -437,7 +437,7 @@ GOLDEN_ROUNDED = [
     (
         GOLDEN_PICKED,
         POSITIONS,
-        "95 03 0e 94 03 0a 0c 02 97 01 01 01 02 02 01 02"
+        "95 04 0e 94 03 0a 0c 02 97 01 01 01 02 02 01 02"
         "c4 30 07000000 0100 0000 0000803e 00000040"  # z
         "0000000000001440 0000000000000000"  # position in full
         "000080be 000000c0"  # unclaimed
@@ -446,7 +446,7 @@ GOLDEN_ROUNDED = [
     (
         GOLDEN_UNCLAIMED,
         POLAR,
-        "95 03 0f 94 03 0a cf7fffffffffffffff 02 97 01 01 02 02 01 02 02"
+        "95 04 0f 94 03 0a cf7fffffffffffffff 02 98 01 01 02 02 01 02 02 00"
         "c4 41 07000000 01 000000000000e0bf"  # log_g in full
         "00000000 00000000 02008040 0000803f 03004040"  # x, P
         "0000000000001440 0000000000000000"  # position in full
@@ -456,7 +456,7 @@ GOLDEN_ROUNDED = [
     (
         GOLDEN_PICKED,
         POLAR,
-        "95 03 10 94 03 0a 0c 02 96 01 01 01 02 02 01"
+        "95 04 10 94 03 0a 0c 02 96 01 01 01 02 02 01"
         "c4 28 07000000 0100 0000 0000803f 00000040"  # z
         "0000000000001440 0000000000000000"  # position in full
         "0000003f 000000c0",  # unclaimed
@@ -480,7 +480,7 @@ GOLDEN_NAMES = ["report", "unclaimed", "picked", "start", "begin", "advice", "re
 
 
 @pytest.mark.parametrize(("message", "golden"), GOLDEN, ids=GOLDEN_NAMES)
-def test_the_bytes_of_version_3_never_change(message: Message, golden: str) -> None:
+def test_the_bytes_of_version_4_never_change(message: Message, golden: str) -> None:
     payload = bytes.fromhex(golden)
     assert encode(message) == payload
     assert same(decode(KEYS.of(message), payload), message)
@@ -489,7 +489,7 @@ def test_the_bytes_of_version_3_never_change(message: Message, golden: str) -> N
 #: Bytes per track, plot or term at 100 of them, 2-D and three sensors: one more number in a message breaks its budget.
 BUDGETS = {
     "report": 126,
-    "tracks": 142,
+    "tracks": 150,
     "start": 245,
     "advice": 117,
     "rebase": 117,
@@ -744,12 +744,16 @@ ENVELOPES = [
     ("blocks too long", altered(GOLDEN_REPORT, blocks=BLOCKS + b"\0"), "54 bytes of blocks, expected 53"),
     (
         "size forged",
-        altered(GOLDEN_REPORT, sizes=[2**32, 1, 2, 0, 0, 0]),
+        altered(GOLDEN_REPORT, sizes=[2**32, 1, 2, 0, 0, 0, 0]),
         "larger than the 53 bytes of blocks can hold",
     ),
-    ("state forged", altered(GOLDEN_REPORT, sizes=[1, 1, 65, 0, 0, 0]), "larger than the 53 bytes of blocks can hold"),
-    ("unclaimed forged", altered(GOLDEN_REPORT, sizes=[1, 1, 2, 0, 2**40, 0]), "larger than the 53 bytes of blocks"),
-    ("unclaimed not sent", altered(GOLDEN_REPORT, sizes=[1, 1, 2, 2, 1, 2]), "53 bytes of blocks, expected 85"),
+    (
+        "state forged",
+        altered(GOLDEN_REPORT, sizes=[1, 1, 65, 0, 0, 0, 0]),
+        "larger than the 53 bytes of blocks can hold",
+    ),
+    ("unclaimed forged", altered(GOLDEN_REPORT, sizes=[1, 1, 2, 0, 2**40, 0, 0]), "larger than the 53 bytes of blocks"),
+    ("unclaimed not sent", altered(GOLDEN_REPORT, sizes=[1, 1, 2, 2, 1, 2, 0]), "53 bytes of blocks, expected 85"),
     ("ids descending", encode(report(2)._replace(ids=np.array([5, 4]))), "ids are not ascending"),
     ("ids repeated", encode(report(2)._replace(ids=np.array([5, 5]))), "ids are not ascending"),
     ("track without term", encode(report(2)._replace(terms=np.array([2, 0]))), "2 terms of tracks, 2 terms sent"),
@@ -785,7 +789,7 @@ def test_tracks_have_one_column_per_sensor() -> None:
 
 
 def test_an_unknown_status_is_refused() -> None:
-    refusal(encode(picture(1)._replace(status=np.array([3], np.uint8))), KEYS.tracks())
+    refusal(encode(picture(1)._replace(status=np.array([4], np.uint8))), KEYS.tracks())
 
 
 def test_a_refusal_is_short_whatever_was_sent() -> None:

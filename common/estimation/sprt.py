@@ -17,10 +17,12 @@ class Status(IntEnum):
     TENTATIVE = 0
     CONFIRMED = 1
     DELETED = 2
+    #: Confirmed, and without a plot for some scans of the sensors that should see it; only what is shown says so.
+    COASTING = 3
 
 
 #: To compare arrays with: a member of an enumeration is slow to look up.
-TENTATIVE, CONFIRMED, DELETED = (np.uint8(status) for status in Status)
+TENTATIVE, CONFIRMED, DELETED, COASTING = (np.uint8(status) for status in Status)
 
 StatusArray = NDArray[np.uint8]
 
@@ -98,3 +100,62 @@ def decide(log_lr: Array, status: StatusArray, limits: Thresholds) -> Verdict:
     new = status.copy()
     new[accepted], new[rejected] = CONFIRMED, DELETED
     return Verdict(np.where(accepted, 0.0, log_lr), new, accepted, rejected)
+
+
+class Existence(NamedTuple):
+    """The likelihood ratio of a track whose target may leave.
+
+    Attributes:
+        log_lr: that the target is there now, against h0 that there never was one, shape (...).
+        log_left: that it was there and has left since, against h0, shape (...); -inf at the start.
+    """
+
+    log_lr: Array
+    log_left: Array
+
+    @property
+    def log_odds(self) -> Array:
+        """Of being there now against all else, with equal priors for h0 and h1, shape (...)."""
+        odds: Array = self.log_lr - np.logaddexp(0.0, self.log_left)
+        return odds
+
+
+def survive(before: Existence, dt: Array, stay: float) -> Existence:
+    """The likelihood ratio after a time in which the target may have left (Eq. 24).
+
+    Args:
+        before: shape (...).
+        dt: time that has passed [s], shapes that broadcast.
+        stay: mean time that targets stay [s]; inf: they stay for ever.
+    """
+    if stay == np.inf:
+        return before
+    with np.errstate(divide="ignore"):  # no time, nothing leaves
+        log_leaving = np.log(-np.expm1(-dt / stay))
+    return Existence(before.log_lr - dt / stay, np.logaddexp(before.log_left, before.log_lr + log_leaving))
+
+
+def decide_with_life(existence: Existence, status: StatusArray, limits: Thresholds) -> tuple[Existence, Verdict]:
+    """One step of the test where targets may leave (theory.md §7).
+
+    h1 of a tentative track is "there was a target"; it is confirmed above log B. From then on its odds of being there
+    now go on without a reset: they cannot grow far above log(stay / interval). Any track is deleted when these odds
+    fall below log A (that of kept tracks, if it is confirmed).
+
+    Args:
+        existence: after the newest data, shape (...).
+        status: before, shape (...).
+        limits: log A, log B.
+
+    Returns:
+        what to go on with, and what was decided; in it, ``log_lr`` is what was compared with the thresholds.
+    """
+    alive, odds = status != DELETED, existence.log_odds
+    accepted = (status == TENTATIVE) & (existence.log_lr > limits.log_b)
+    kept = limits.log_a if limits.log_a_kept is None else limits.log_a_kept
+    rejected = alive & ~accepted & (odds < np.where(status == CONFIRMED, kept, limits.log_a))
+    new = status.copy()
+    new[accepted], new[rejected] = CONFIRMED, DELETED
+    known = new == CONFIRMED
+    after = Existence(np.where(known, odds, existence.log_lr), np.where(known, -np.inf, existence.log_left))
+    return after, Verdict(np.where(accepted, existence.log_lr, odds), new, accepted, rejected)

@@ -12,12 +12,12 @@ import numpy as np
 from common.config import Scenario
 from common.errors import EvaluationError
 from common.estimation.gaussian import Array
-from common.estimation.sprt import CONFIRMED
+from common.estimation.sprt import CONFIRMED, Status
 from common.limits import MAX_ESTIMATE
 from common.messages import IntArray, Tracks
 from scenarios.json_lines import identity, numbers, read_lines, seconds
 
-_STATUS = ("tentative", "confirmed", "deleted")
+_STATUS = tuple(status.name.lower() for status in Status)
 
 
 class Run(NamedTuple):

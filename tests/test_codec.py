@@ -126,6 +126,7 @@ def picture(tracks: int, n: int = 4, sensors: int = 3) -> Tracks:
         log_lr_total=rng.standard_normal(tracks),
         x=rng.standard_normal((tracks, n)),
         P=covariances(rng, tracks, n),
+        supported_ns=np.arange(tracks) + 1_700_000_000_000_000_000,
     )
 
 

@@ -108,7 +108,7 @@ def test_only_confirmed_tracks_count(tmp_path: Path) -> None:
 def test_a_folder_tells_when_it_was_measured(tmp_path: Path) -> None:
     """A run had nothing to report at first, or ever."""
     record = Record(scenario())
-    none = Tracks(0, ("a",), *(np.empty(0, np.int64) for _ in range(8)))  # type: ignore[arg-type]
+    none = Tracks(0, ("a",), *(np.empty(0, np.int64) for _ in range(9)))  # type: ignore[arg-type]
     for second in (1, 2, 3):
         record.note(none._replace(x=np.empty((0, 4)), time_ns=record.scenario.to_ns(float(second))))
     write_report(record, tmp_path, {})

@@ -42,6 +42,7 @@ def tracks(time_s: float, ids: Sequence[int], x: Array, P: Array) -> Tracks:
         log_lr_total=np.arange(count) + 10.0 * time_s,
         x=x,
         P=P,
+        supported_ns=np.zeros(len(ids), np.int64),
     )
 
 

@@ -45,6 +45,7 @@ def picture(time_s: float, tracks: dict[int, Status]) -> Tracks:
         log_lr_total=np.zeros(count),
         x=np.zeros((count, 4)),
         P=np.tile(np.eye(4), (count, 1, 1)),
+        supported_ns=np.zeros(count, np.int64),
     )
 
 

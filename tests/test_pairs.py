@@ -57,6 +57,7 @@ def told(world: Truth, who: list[list[int]]) -> list[Tracks]:
                 log_lr_total=np.zeros(count),
                 x=np.array([world.x[targets[row], k] for row in rows]).reshape(count, n),
                 P=np.repeat(np.eye(n)[None], count, axis=0),
+                supported_ns=np.zeros(count, np.int64),
             )
         )
     return said

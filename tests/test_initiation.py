@@ -103,7 +103,8 @@ def test_of_tracks_that_are_one_the_stronger_stays() -> None:
         status=np.array([0, 1, 0, 0, 0], np.uint8),
         log_lr_total=np.array([30.0, 10.0, 5.0, 1.0, 1.0]),
     )
-    merged, decisions = initiation_of(plot).merged(there)
+    merged, pairs, decisions = initiation_of(plot).merged(there, there, {})
+    assert not pairs
     assert [(decision.track, decision.into) for decision in decisions] == [(0, 1), (2, 1), (4, 3)]
     assert merged.status.tolist() == [2, 1, 2, 0, 2]
     assert {decision.kind for decision in decisions} == {"merged"}
@@ -114,7 +115,7 @@ def test_targets_side_by_side_or_crossing_are_two(change: dict[str, float]) -> N
     plot = starting()
     there = picture(plot, [[0.0, 0.0], [change.get("apart", 0.0), 0.0]])
     there.fused_x[1, 2] = change.get("speed", 0.0)
-    assert not initiation_of(plot).duplicates(there)
+    assert initiation_of(plot).duplicates(there, there, {}) == ([], {})
 
 
 def test_plots_that_are_no_place_start_nothing() -> None:

@@ -19,13 +19,8 @@ from common.estimation.association import (
     within_reach,
 )
 from common.estimation.detection import Notch
-<<<<<<< HEAD
-from common.estimation.gaussian import Array, Gaussian, log_sum_exp
-from common.estimation.imm import Imm, Modes, predict_modes, predict_probabilities
-=======
 from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
-from common.estimation.imm import Imm, Modes, predict_modes
->>>>>>> 62ab499 (Tracks have a life: survival, coasting, lost; whether two confirmed tracks are one is a sequential test)
+from common.estimation.imm import Imm, Modes, predict_modes, predict_probabilities
 from common.estimation.joint import joint
 from common.estimation.mixture import Mixture, Reduction, step, step_with, terms
 from common.estimation.motion import Motion

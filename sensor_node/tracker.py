@@ -25,13 +25,8 @@ from common.estimation.selection import Selection, select
 from common.local_filter import SUREST, LocalFilter
 from common.messages import NEVER, Advice, Begin, IntArray, Join, Picked, Rebase, Report, Scan, Start, Stop
 from common.quantities import NS_PER_S
-<<<<<<< HEAD
-from sensor_node.sight import Sight
-from sensor_node.state import Beliefs, Look, Ready, Schedule, State, Tracks, alike, left, put_tracks, with_before
-=======
 from sensor_node.sight import Seen, Sight
-from sensor_node.state import Look, Ready, Schedule, State, Tracks, alike, left, put_tracks
->>>>>>> 62ab499 (Tracks have a life: survival, coasting, lost; whether two confirmed tracks are one is a sequential test)
+from sensor_node.state import Beliefs, Look, Ready, Schedule, State, Tracks, alike, left, put_tracks, with_before
 
 
 @dataclass(frozen=True)
@@ -279,19 +274,13 @@ class LocalTracker:
         for kept in state.recent:
             look, due = kept if alone else left(kept), fresh.times_ns < kept.time_ns
             if due.any():
-<<<<<<< HEAD
                 part = take(fresh, due)
                 recent.append(with_before(kept, self._beliefs(part)) if self.advised else kept)
                 predicted, mixture, expected = self._expect(part, look.time_ns, look.pose, look.number)
-                mixture, visible, _ = self.sights[look.number].look(self.filter, predicted, mixture, expected, look)
-                fresh = put_tracks(fresh, due, self._with(predicted, mixture)._replace(visible=visible))
-            else:
-                recent.append(kept)
-=======
-                predicted, mixture, expected = self._expect(take(fresh, due), look.time_ns, look.pose, look.number)
                 seen = self.sights[look.number].look(self.filter, predicted, mixture, expected, look)
                 fresh = put_tracks(fresh, due, self._with(predicted, seen.mixture)._replace(visible=seen.visible))
->>>>>>> 62ab499 (Tracks have a life: survival, coasting, lost; whether two confirmed tracks are one is a sequential test)
+            else:
+                recent.append(kept)
         tracks = concatenate(*alike(state.tracks, fresh))
         tracks = take(tracks, np.argsort(tracks.ids))
         return state._replace(tracks=tracks, recent=tuple(recent))

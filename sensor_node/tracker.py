@@ -365,9 +365,10 @@ class LocalTracker:
         predicted, visible = honest.predict(prior, dt), self._still_visible(tracks.visible, dt)
         expected = sight.expect(honest, predicted, look.pose, visible[:, look.number])
         then = self._recalled(tracks, look.before)._replace(visible=visible)
-        (log_w, _, ((x_a,), (P_a,))), visible, _ = sight.look(honest, then, predicted, expected, look)
+        seen = sight.look(honest, then, predicted, expected, look)
+        log_w, _, ((x_a,), (P_a,)) = seen.mixture
         times = np.full_like(tracks.times_a_ns, look.time_ns)
-        return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times, visible=visible)
+        return tracks._replace(log_w=log_w, x_a=x_a, P_a=P_a, times_a_ns=times, visible=seen.visible)
 
     def _fresh(self, start: Start) -> Tracks:
         """Tracks as they are told of."""

@@ -596,7 +596,7 @@ def test_a_rounded_covariance_stays_positive_definite(seed: int, digits: float, 
 
 def test_a_reference_of_too_many_numbers_is_no_message() -> None:
     envelope = msgpack.unpackb(encode(report(2), rounding=POLAR))
-    envelope[3][-1] = 5
+    envelope[3][-2] = 5
     envelope[4] += bytes(4 * 3)
     with pytest.raises(DecodeError, match="a reference of 5 numbers, x has 4"):
         decode(KEYS.report("radar-1"), msgpack.packb(envelope))

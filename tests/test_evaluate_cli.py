@@ -74,7 +74,7 @@ def test_a_line_that_is_no_truth_is_named(tmp_path: Path, line: Any, reason: str
     ("line", "reason"),
     [
         ({"time": 2.0, "track": 5, "kind": "confirmed"}, "status is missing"),
-        ({**LINE, "status": "lost"}, "status: 'lost' is not one of tentative, confirmed, deleted"),
+        ({**LINE, "status": "lost"}, "status: 'lost' is not one of tentative, confirmed, deleted, coasting"),
         ({**LINE, "track": 1.5}, "track: 1.5 is not a whole number between -1e+15 and 1e+15"),
         (
             {**LINE, "x": [1.0, 2.0]},

@@ -51,6 +51,7 @@ def run(
     seed: Seed | None = None,
     speed: Speed = 1.0,
     out: Path | None = None,
+    wait: Seconds = 10.0,
     verbose: Verbose = False,
 ) -> None:
     """Run all processes of a network on this machine, and write a report.
@@ -61,6 +62,7 @@ def run(
         seed: of the simulated world, instead of the scenario's.
         speed: seconds of measurement time per second; max: as fast as all go together.
         out: folder of the report, which must not hold one yet; default runs/SCENARIO-TIME.
+        wait: seconds to wait for the others once a sensor has joined, more on a busy machine.
         verbose: tell and log decisions on tracks that were never confirmed too.
     """
     from rich.console import Console
@@ -83,6 +85,7 @@ def run(
         speed=speed,
         out=out or default_folder(loaded.name, stamp),
         scans=scans,
+        wait_s=wait,
         verbose=verbose,
     )
     execute(order, Console(stderr=False, highlight=False))

@@ -42,6 +42,7 @@ class Order:
         speed: seconds of measurement time per second, 0: lockstep.
         out: folder of the report.
         scans: of all sources, by time.
+        wait_s: for the other sensors, once one has joined.
         verbose: tell and log decisions on tracks that were never confirmed too.
     """
 
@@ -52,6 +53,7 @@ class Order:
     speed: float
     out: Path
     scans: Sequence[Scan]
+    wait_s: float = 10.0
     verbose: bool = False
 
 
@@ -112,7 +114,8 @@ class Run:
         write_atomically(file, f'name = "{self._keys.network}"\n'.encode())
         self._shared = ["--network", str(file), *_options("--connect", here)]
         speed = str(self._order.speed) if self._order.speed else "max"
-        how = ["--listen", "tcp/127.0.0.1:0", "--speed", speed, *(["--verbose"] if self._order.verbose else [])]
+        how = ["--listen", "tcp/127.0.0.1:0", "--speed", speed, "--wait", str(self._order.wait_s)]
+        how += ["--verbose"] if self._order.verbose else []
         self._start(CENTER, "fusion_center", [str(self._order.path), *self._shared, *how])
 
     def _start_sensors(self, center: tuple[str, ...]) -> None:

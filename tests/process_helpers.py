@@ -134,6 +134,10 @@ class Processes:
         """Start ``waldnet`` with arguments."""
         return self.start(WALDNET, *map(str, arguments))
 
+    def run(self, scenario: object, *arguments: object) -> Process:
+        """Start ``waldnet run`` of a network that waits for all its sensors, however slowly they start."""
+        return self.waldnet("run", scenario, *arguments, "--wait", PATIENCE_S)
+
     def start(self, *command: str) -> Process:
         """Start a command."""
         self._started.append(Process(list(command), self._family, self.cwd))

@@ -66,11 +66,8 @@ REAL = {
 #: A loaded machine must not bring the center to go on without a sensor that is still there.
 PATIENT = ('association = "tight"', 'association = "tight"\nhold_back = 1000.0')
 #: The target stays in sight for a long time.
-LONG = (
-    ("duration = 60.0", "duration = 3000.0"),
-    ("psd = 10.0", "psd = 0.1"),
-    ("state = [0.0, 0.0, 150.0, 0.0]", "state = [0.0, 0.0, 0.0, 0.0]"),
-)
+STEADY = (("psd = 10.0", "psd = 0.1"), ("state = [0.0, 0.0, 150.0, 0.0]", "state = [0.0, 0.0, 0.0, 0.0]"))
+LONG = (("duration = 60.0", "duration = 3000.0"), *STEADY)
 
 
 class Ran(NamedTuple):
@@ -100,7 +97,7 @@ def lockstep(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     name: str = request.param
     folder = tmp_path_factory.mktemp(name)
     with Processes(folder) as processes:
-        run = processes.waldnet("run", name, "--speed", "max", "--out", folder / "out")
+        run = processes.run(name, "--speed", "max", "--out", folder / "out")
         recording = load_scenario(find(name)).recording
         plots = folder / "plots.jsonl" if recording is None else recording.plots
         if recording is None:
@@ -180,7 +177,7 @@ def test_a_lockstep_run_with_several_hypotheses_or_feedback_says_what_replay_say
     short = ("duration = 60.0", "duration = 16.0")
     undecided = ("p1 = 0.95", "p1 = 0.95\nenabled = false")
     path = variant(tmp_path, "elaborate", ('association = "tight"', fusion), short, undecided)
-    run = processes.waldnet("run", path.name, "--speed", "max", "--out", "out")
+    run = processes.run(path.name, "--speed", "max", "--out", "out")
     assert run.wait() == 0, run.err
     assert processes.alive() == {}
     tracks = points((tmp_path / "out" / "tracks.jsonl").read_text().splitlines())
@@ -191,7 +188,7 @@ def test_a_lockstep_run_with_several_hypotheses_or_feedback_says_what_replay_say
 
 def test_a_run_in_real_time_says_what_replay_says(processes: Processes, tmp_path: Path) -> None:
     path = variant(tmp_path, "my scenario", PATIENT, ('name = "four-radars"', 'name = "patient"'))
-    run = processes.waldnet("run", path.name, "--speed", "30", "--out", "a folder/of mine")
+    run = processes.run(path.name, "--speed", "30", "--out", "a folder/of mine")
     assert run.wait() == 0, run.err
     assert processes.alive() == {}
     folder = Path("a folder/of mine")
@@ -202,8 +199,10 @@ def test_a_run_in_real_time_says_what_replay_says(processes: Processes, tmp_path
 
 
 def test_a_sensor_that_dies_does_not_end_the_run(processes: Processes, tmp_path: Path) -> None:
-    path = variant(tmp_path, "patient", PATIENT)
-    run = processes.waldnet("run", path, "--speed", "20", "--out", "out")
+    # Confirmed after three scans, so that all sensors have shown some; three sensors may miss a target at once.
+    kept = ("p0 = 1e-4\np1 = 0.95", "p0 = 1e-30\np1 = 0.95\nkeep = 0.9999")
+    path = variant(tmp_path, "patient", PATIENT, ("duration = 60.0", "duration = 160.0"), *STEADY, kept)
+    run = processes.run(path, "--speed", "20", "--out", "out")
     run.await_line("track 0 confirmed")
     processes.kill("sensor_node", "radar-2")
     run.await_line("sensor radar-2 died (killed by SIGKILL); the run goes on with the others")
@@ -212,7 +211,7 @@ def test_a_sensor_that_dies_does_not_end_the_run(processes: Processes, tmp_path:
     report = json.loads((tmp_path / "out" / "decisions.json").read_text())
     assert report["sensors_lost"] == {"radar-2": "killed by SIGKILL"}
     assert report["tracks"][0]["status"] == "confirmed"
-    assert report["tracks"][0]["last_time"] == 60.0
+    assert report["tracks"][0]["last_time"] == 160.0
     lost = [entry for entry in log_of(tmp_path / "out", "center") if "sensor lost" in entry["event"]]
     assert [entry["sensor"] for entry in lost] == ["radar-2"]
     tracks = points((tmp_path / "out" / "tracks.jsonl").read_text().splitlines())
@@ -245,7 +244,8 @@ def log_of(folder: Path, name: str) -> list[dict[str, Any]]:
 
 
 def test_a_center_that_dies_ends_the_run(processes: Processes, tmp_path: Path) -> None:
-    run = processes.waldnet("run", "four-radars-0.2", "--speed", "8", "--out", "out")
+    path = variant(tmp_path, "long", ("duration = 60.0", "duration = 600.0"), of="four-radars-0.2")
+    run = processes.run(path, "--speed", "8", "--out", "out")
     run.await_line("track 4 deleted")  # a scan after the confirmation, so that has been heard of for certain
     processes.kill("fusion_center")
     assert run.wait() == 1
@@ -258,7 +258,8 @@ def test_a_center_that_dies_ends_the_run(processes: Processes, tmp_path: Path) -
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_run_that_is_stopped_writes_its_report(processes: Processes, tmp_path: Path, number: signal.Signals) -> None:
-    run = processes.waldnet("run", "four-radars-0.2", "--speed", "8", "--out", "out")
+    path = variant(tmp_path, "long", ("duration = 60.0", "duration = 600.0"), of="four-radars-0.2")
+    run = processes.run(path, "--speed", "8", "--out", "out")
     run.await_line("track 4 deleted")  # a scan after the confirmation
     run.signal(number)
     assert run.wait() == 0, run.err
@@ -273,7 +274,7 @@ def test_a_run_that_is_stopped_writes_its_report(processes: Processes, tmp_path:
 
 def test_processes_whose_launcher_is_killed_end_by_themselves(processes: Processes, tmp_path: Path) -> None:
     path = variant(tmp_path, "long", *LONG)
-    run = processes.waldnet("run", path, "--speed", "2", "--out", "out")
+    run = processes.run(path, "--speed", "2", "--out", "out")
     run.await_line("track 0 confirmed")
     family = processes.alive()
     assert len(family) == 6
@@ -375,7 +376,7 @@ def test_a_node_without_a_center_gives_up(processes: Processes) -> None:
     assert node.wait() == 1
     assert node.out == []
     assert re.fullmatch(
-        r"no center of network 'four-radars' answered 'radar-1' within [12] s \(peer at tcp/127\.0\.0\.1:\d+\): .*",
+        r"no center of network 'four-radars' answered 'radar-1' within \d+ s \(peer at tcp/127\.0\.0\.1:\d+\): .*",
         node.err[-1],
     )
 
@@ -571,7 +572,7 @@ def test_surroundings_do_not_matter(processes: Processes, tmp_path: Path, monkey
     """Zenoh logs to standard output if the environment wants it; modules may be called like some of the library's."""
     monkeypatch.setenv("RUST_LOG", "info")
     (tmp_path / "json.py").write_text("raise ImportError('not this one')")
-    run = processes.waldnet("run", "four-radars", "--speed", "max", "--out", "out")
+    run = processes.run("four-radars", "--speed", "max", "--out", "out")
     assert run.wait() == 0, run.err
     assert run.err == []
 

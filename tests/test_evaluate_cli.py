@@ -110,7 +110,9 @@ def test_a_folder_tells_when_it_was_measured(tmp_path: Path) -> None:
     record = Record(scenario())
     none = Tracks(0, ("a",), *(np.empty(0, np.int64) for _ in range(9)))  # type: ignore[arg-type]
     for second in (1, 2, 3):
-        record.note(none._replace(x=np.empty((0, 4)), time_ns=record.scenario.to_ns(float(second))))
+        record.note(
+            none._replace(x=np.empty((0, 4)), P=np.empty((0, 4, 4)), time_ns=record.scenario.to_ns(float(second)))
+        )
     write_report(record, tmp_path, {})
     assert (tmp_path / "tracks.jsonl").read_text() == ""
     assert read_run(tmp_path, 2).span_s == (1.0, 3.0)

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from common.limits import FULL_CIRCLE, MAX_SECONDS, ZENITH
+from common.limits import FULL_CIRCLE, MAX_PLOTS, MAX_SECONDS, ZENITH
 
 NS_PER_S = 1_000_000_000
 
@@ -78,6 +78,11 @@ def _false_plots(value: float) -> float:
         raise ValueError(
             f"{value:g} is not positive and finite; without false plots one plot would prove a target and there is "
             "nothing to test: give the smallest mean you believe, such as 1e-6"
+        )
+    if value > MAX_PLOTS:
+        raise ValueError(
+            f"{value:g} is more than the {MAX_PLOTS} plots that a scan may have; it is the mean number in one scan of "
+            "the whole field of view, not a density"
         )
     return value
 

@@ -104,7 +104,9 @@ def seconds(value: Any) -> float:
         ValueError: for anything else.
     """
     if not _is_number(value) or abs(value) > MAX_SECONDS:
-        raise ValueError(f"time: {value!r} is not a number of seconds between -{MAX_SECONDS:g} and {MAX_SECONDS:g}")
+        unit = "; are these milliseconds, or nanoseconds?" if _is_number(value) else ""
+        expected = f"a number of seconds between -{MAX_SECONDS:g} and {MAX_SECONDS:g}"
+        raise ValueError(f"time: {value!r} is not {expected}{unit}")
     return float(value)
 
 

@@ -15,8 +15,6 @@ from scenarios.precision_check import precision_faults
 
 #: A standard deviation of an angle above this is hardly one in radians [rad].
 WIDEST_SIGMA = 0.5
-#: More false plots per scan cannot be worked with.
-MOST_FALSE_PLOTS = 1e5
 #: Hypotheses that differ by less (squared Mahalanobis distance) are one track: the default of ``initiation.merge``.
 NEAREST_HYPOTHESES = 0.5
 #: A track that lies inside with less than this probability is not seen.
@@ -64,12 +62,6 @@ def _of_sensor(scenario: Scenario, sensor: SensorConfig) -> Iterator[Finding]:
             )
     if sensor.p_d == 0.0:
         yield Finding(f"{where}: p_d", "0 means that the sensor never detects anything. Leave it out of the scenario.")
-    if sensor.false_plots > MOST_FALSE_PLOTS:
-        yield Finding(
-            f"{where}: false_plots",
-            f"{sensor.false_plots:g} false plots per scan are more than a computer works with in time (up to about "
-            f"{MOST_FALSE_PLOTS:g}). It is the mean number in one scan of the whole field of view, not a density.",
-        )
     yield from _too_dense(scenario, sensor, where)
 
 

@@ -708,3 +708,11 @@ def test_a_byte_order_mark_before_a_scenario(tmp_path: Path) -> None:
     shipped = catalogue.find("no-target")
     (tmp_path / "marked.toml").write_bytes(b"\xef\xbb\xbf" + shipped.read_bytes())
     assert load_scenario(tmp_path / "marked.toml") == load_scenario(shipped)
+
+
+def test_false_plots_that_no_scan_may_have(tmp_path: Path) -> None:
+    text = catalogue.find("no-target").read_text().replace("false_plots = 5.0", "false_plots = 1e9", 1)
+    assert faults(tmp_path, text) == [
+        "sensor.0.false_plots: 1e+09 is more than the 65535 plots that a scan may have; it is the mean number in one "
+        "scan of the whole field of view, not a density"
+    ]

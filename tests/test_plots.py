@@ -153,6 +153,11 @@ BAD = [
         '{"sensor": "a", "time": -Infinity, "plots": []}',
         "time: -inf is not a number of seconds between -4e+09 and 4e+09",
     ),
+    (
+        {**LINE, "time": 1767225600000},
+        "time: 1767225600000 is not a number of seconds between -4e+09 and 4e+09; "
+        "are these milliseconds, or nanoseconds?",
+    ),
     ({**LINE, "plots": 3}, "plots: 3 is not a list of plots"),
     ({**LINE, "plots": {"0": [1, 2]}}, "plots: {'0': [1, 2]} is not a list of plots"),
     ({**LINE, "plots": [1, 2]}, "plots.0: 1 is not a list of 2 finite numbers"),

@@ -27,13 +27,13 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
         with _naming(path), path.open("wb") as file:
             yield file
         return
-    path = path.resolve()  # a link stays one
-    draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    target = path.resolve()  # a link stays one
+    draft = target.with_name(f"{target.name}.{os.getpid()}.tmp")
     try:
-        with _naming(path):
+        with _naming(path, draft):
             with draft.open("wb") as file:
                 yield file
-            draft.replace(path)
+            draft.replace(target)
     finally:
         draft.unlink(missing_ok=True)
 
@@ -111,11 +111,11 @@ class LinesFile:
 
 
 @contextmanager
-def _naming(path: Path) -> Iterator[None]:
-    """Say in errors of the system which file they are about."""
+def _naming(path: Path, draft: Path | None = None) -> Iterator[None]:
+    """Say in errors of the system which file they are about, where they say nothing or name the draft."""
     try:
         yield
     except OSError as error:
-        if error.filename is not None and error.filename2 is None:
+        if error.filename not in (None, str(draft)):
             raise
         raise OSError(error.errno, error.strerror, str(path)) from None

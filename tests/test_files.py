@@ -31,6 +31,13 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_errors_name_the_file_and_not_its_draft(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileNotFoundError) as caught:
+        write_atomically(Path("no", "file"), b"content")
+    assert caught.value.filename == "no/file"
+
+
 def test_a_device_is_written_and_stays_a_device(tmp_path: Path) -> None:
     write_atomically(Path(os.devnull), b"nothing")
     assert Path(os.devnull).is_char_device()

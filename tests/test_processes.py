@@ -282,6 +282,11 @@ def test_processes_whose_launcher_is_killed_end_by_themselves(processes: Process
     assert run.wait() == -signal.SIGKILL
     processes.await_end(family)
     assert processes.alive() == {}
+    # What had come by then is there, in whole lines.
+    decided = [json.loads(line) for line in (tmp_path / "out" / "decisions.jsonl").read_text().splitlines()]
+    assert [(entry["track"], entry["kind"]) for entry in decided][:1] == [(0, "confirmed")]
+    told = [json.loads(line) for line in (tmp_path / "out" / "tracks.jsonl").read_text().splitlines()]
+    assert {entry["track"] for entry in told} <= set(range(5))
 
 
 @pytest.mark.parametrize(

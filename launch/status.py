@@ -139,7 +139,7 @@ class LiveStatus:
     def _counts(self, hidden: int) -> Text:
         counts = Counter(row.status for row in self._rows.values())
         told = ", ".join(f"{counts[status]} {status.name.lower()}" for status in Status if counts[status])
-        more = f"; {hidden} of them not shown" if hidden else ""
+        more = f"; {hidden} not shown" if hidden else ""
         return _line(Text(f"tracks  {told or 'none'}{more}"))
 
     def _sensors(self) -> Text:

@@ -246,6 +246,7 @@ class RunFolder:
                     **{name: line[name] for name in ("status", "log_lr", "log_lr_total")},
                     "last_time": line["time"],
                     "x": line["x"],
+                    "supported": line["supported"],
                     "decisions": _standing([_entry(journal, place) for place in decided.of(track)]),
                 }
 

@@ -54,6 +54,7 @@ def tracks_of(record: Record) -> list[dict[str, Any]]:
             "log_lr_total": tracks.log_lr_total[row],
             "last_time": record.scenario.to_seconds(tracks.time_ns),
             "x": tracks.x[row].tolist(),
+            "supported": record.scenario.to_seconds(int(tracks.supported_ns[row])),
             "decisions": [decision_entry(d, record.scenario) for d in record.standing() if d.track == track],
         }
         for track, (row, tracks) in sorted(last.items())
@@ -155,6 +156,7 @@ def crowd(plot: Scenario, number: int) -> Iterable[Message]:
             log_lr_total=np.full(count, 0.1 * k),
             x=np.ones((count, 4)),
             P=np.tile(np.eye(4), (count, 1, 1)),
+            supported_ns=np.zeros(count, np.int64),
         )
         for name in plot.sensor_names:
             yield Scan(name, time_ns, np.zeros(2), np.ones((3, 2)))

@@ -43,6 +43,7 @@ def picture(time_s: float, tracks: dict[int, Status], log_lr: float = 0.0) -> Tr
         log_lr_total=np.full(count, log_lr),
         x=np.zeros((count, 4)),
         P=np.tile(np.eye(4), (count, 1, 1)),
+        supported_ns=np.zeros(count, np.int64),
     )
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import Scenario
+from common.config import Scenario, SensorConfig
 from common.estimation.batch import concatenate, put, take
 from common.estimation.gaussian import (
     Array,
@@ -24,6 +24,7 @@ from common.estimation.gaussian import (
 from common.estimation.imm import Imm, Modes, predict_modes
 from common.estimation.mixture_product import multiply_mixtures
 from common.estimation.motion import Motion
+from common.estimation.pose import SensorPose
 from common.estimation.ratio import log_lambda
 from common.estimation.representation import Share, globalise, shrink
 from common.estimation.sensing import Sensor
@@ -33,6 +34,11 @@ from common.messages import IntArray, Picked, Rebase, Report
 from common.quantities import NS_PER_S
 from fusion_center.picture import Backup, Picture, common
 from fusion_center.refusal import Refusal
+
+#: A scan says less than a missed detection by so much only if its node follows something else.
+_DOUBTFUL = 1.0
+#: A sensor that detects a target with less than this probability, log(1 - p), does not see it.
+_LOG_BLIND = float(np.log1p(-0.05))
 
 
 class Heard(NamedTuple):
@@ -136,6 +142,8 @@ class Fuser:
         terms: most terms of a factor.
         stay_s: mean time that targets stay [s].
         globalised: predict as ``dkf`` does.
+        configs: of the sensors, where tracks have a life: no report says less of a track than a missed detection;
+            otherwise empty.
     """
 
     motion: Motion
@@ -144,6 +152,7 @@ class Fuser:
     terms: int
     stay_s: float
     globalised: bool
+    configs: tuple[SensorConfig, ...] = ()
 
     @classmethod
     def of(cls, scenario: Scenario) -> Fuser:
@@ -156,6 +165,7 @@ class Fuser:
             terms=len(motion.models) if isinstance(motion, Imm) else scenario.fusion.terms,
             stay_s=scenario.stay,
             globalised=scenario.fusion.mode == "dkf",
+            configs=() if scenario.life is None else scenario.sensors,
         )
 
     def empty(self) -> Picture:
@@ -272,12 +282,16 @@ class Fuser:
         if isinstance(self.motion, Imm):  # which model is in force each factor goes on to say for itself
             log_a = then.log_a[old]
         part = take(now, rows) if not isinstance(rows, slice) else now
-        total, possible = then.log_lr_total[old], part.log_lr_total > -np.inf
-        # What confirmations took from log LR since stays taken.
-        taken = np.subtract(part.log_lr_total, part.log_lr, out=np.zeros_like(total), where=possible)
+        total, log_lr = then.log_lr_total[old], then.log_lr[old]
+        if not self.configs:
+            # What confirmations took from log LR since stays taken.
+            possible = part.log_lr_total > -np.inf
+            taken = np.subtract(part.log_lr_total, part.log_lr, out=np.zeros_like(total), where=possible)
+            log_lr = np.where(possible, total - taken, log_lr)
         part = part._replace(
             times_ns=np.full_like(part.times_ns, told.time_ns),
-            log_lr=np.where(possible, total - taken, then.log_lr[old]),
+            log_lr=log_lr,
+            log_left=then.log_left[old],
             log_lr_total=total,
             log_p_bar=np.zeros_like(part.log_p_bar),
             log_a=log_a,
@@ -334,6 +348,8 @@ class Fuser:
         evidence = np.where(same, 0.0, said.log_p_bar) - np.where(same, 0.0, picture.log_p_bar)
         # A track that nobody reported stays as it is, to the last digit.
         step = np.where(heard, log_lambda(before, after, evidence), 0.0)
+        if self.configs and (step < -_DOUBTFUL).any():
+            said, after, step = self._plausible(expected, reports, said, evidence, after, step)
         network_P = self._shrunk(expected.network_P, reports) if self.globalised else expected.network_P
         elapsed_s = (expected.t_ns - picture.times_ns) / NS_PER_S
         existence = survive(Existence(picture.log_lr, picture.log_left), elapsed_s, self.stay_s)
@@ -354,6 +370,85 @@ class Fuser:
             fused_P=after.density.P,
             network_P=network_P,
         )
+
+    def _plausible(
+        self,
+        expected: Expected,
+        reports: Mapping[int, Heard],
+        said: Reported,
+        evidence: Array,
+        after: Product,
+        step: Array,
+    ) -> tuple[Reported, Product, Array]:
+        """Leave out what sensors say against tracks that they cannot see.
+
+        Whatever the plots are, a scan makes a track ``1 - p_d P(in view)`` times as probable at least. Where the fused
+        track is out of view that is 1. Far less comes from a node that follows something else: it counts as a miss of
+        the fused track, and its factor waits until it fits again.
+
+        Args:
+            expected: the picture, predicted to the measurement time.
+            reports: by number of the sensor.
+            said: what they say.
+            evidence: new log p_bar, shape (T, S).
+            after: product of all factors, as reported.
+            step: log Lambda of every track, shape (T,).
+
+        Returns:
+            what is left of the reports, and the product and log Lambda with that.
+        """
+        rows = np.flatnonzero(step < -_DOUBTFUL)
+        fused = take(expected.product.density, rows)
+        miss = np.zeros((len(rows), len(self.sensors)))
+        for number, heard in reports.items():
+            log_missed = self._log_missed(number, heard.report.pose, fused)
+            miss[:, number] = np.where(said.who[rows, number], log_missed, 0.0)
+        short = (step[rows] < miss.sum(axis=-1) - _DOUBTFUL) & (said.who[rows] & (miss > _LOG_BLIND)).any(axis=-1)
+        rows, miss = rows[short], miss[short]
+        if not len(rows):
+            return said, after, step
+        product, who = take(expected.product, rows), said.who[rows]
+        left = np.zeros(who.shape, np.bool_)
+        for number in reports:
+            alone, _ = self._product(expected, said, rows, np.arange(len(self.sensors)) == number)
+            gain = log_lambda(product, alone, evidence[rows, number, None])
+            blind = miss[:, number] > _LOG_BLIND
+            left[:, number] = who[:, number] & blind & (gain < miss[:, number] - _DOUBTFUL)
+        part, terms = self._product(expected, said, rows, ~left)
+        part_step = log_lambda(product, part, np.where(left, miss, evidence[rows]))
+        said = put(said, rows, terms._replace(who=who & ~left, log_p_bar=said.log_p_bar[rows]))
+        return said, put(after, rows, part), _put(step, rows, np.where(left.any(axis=-1), part_step, step[rows]))
+
+    def _log_missed(self, number: int, pose: SensorPose, fused: Gaussian) -> Array:
+        """Log probability that a scan of a sensor misses targets, shapes (R, n), (R, n, n) to (R,)."""
+        sensor, d = self.sensors[number].at(pose).without_notch, self.motion.dimensions
+        position = Gaussian(fused.x[:, :d], fused.P[:, :d, :d])
+        inside = sensor.field_of_view.probability_inside(position, self.configs[number].view_center(pose.position))
+        with np.errstate(divide="ignore"):  # surely seen
+            return np.log1p(-sensor.detection_probability(fused, pose.position) * inside)
+
+    @staticmethod
+    def _product(expected: Expected, said: Reported, rows: IntArray, used: BoolArray) -> tuple[Product, Reported]:
+        """The product of reported factors where they are used, and of predicted ones elsewhere.
+
+        Args:
+            expected: the predicted ones.
+            said: the reported ones.
+            rows: of the tracks, shape (R,).
+            used: shape (S,) or (R, S).
+
+        Returns:
+            the product; and the reports, without what is not used.
+        """
+        used = np.broadcast_to(used, (len(rows), said.who.shape[1]))
+
+        def chosen(reported: Array, predicted: Array) -> Array:
+            return np.where(used.reshape(*used.shape, *(1,) * (reported.ndim - 2)), reported[rows], predicted[rows])
+
+        log_a, P = chosen(said.log_a, expected.log_a), chosen(said.P, expected.factors.P)
+        factors = Whitened(*(chosen(*pair) for pair in zip(said.factors, expected.whitened, strict=True)))
+        part = Reported(said.who[rows], said.log_p_bar[rows], log_a, P, factors, said.supported[rows])
+        return multiply_mixtures(log_a, factors), part
 
     def _predict(self, picture: Picture, t_ns: int) -> tuple[Array, Gaussian, Array]:
         """Predict all factors and the weights of their terms as their nodes do (Eq. 5)."""
@@ -396,7 +491,15 @@ def _with_terms(report: Report, usable: BoolArray) -> Report:
         log_g=report.log_g[rows],
         x=report.x[rows],
         P=report.P[rows],
+        supported=report.supported[kept] if len(report.supported) else report.supported,
     )
+
+
+def _put(values: Array, rows: IntArray, part: Array) -> Array:
+    """A copy of values with some replaced, shape (T,)."""
+    values = values.copy()
+    values[rows] = part
+    return values
 
 
 def _collect(expected: Expected, reports: Mapping[int, Heard]) -> Reported:

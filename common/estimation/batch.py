@@ -1,4 +1,4 @@
-"""Rows of a batch: a NamedTuple whose arrays share their first axis."""
+"""Rows of a batch: a NamedTuple whose arrays, and batches, share their first axis."""
 
 from __future__ import annotations
 
@@ -14,13 +14,15 @@ def take(batch: Batch, rows: NDArray[Any]) -> Batch:
     """The chosen rows (a mask or indices) of every array; the batch itself where a mask chooses all."""
     if rows.dtype == np.bool_ and rows.all():
         return batch
-    return type(batch)(*(array[rows] for array in batch))
+    return type(batch)(*(take(part, rows) if isinstance(part, tuple) else part[rows] for part in batch))
 
 
 def put(batch: Batch, rows: NDArray[Any], part: Batch) -> Batch:
     """The batch with the chosen rows replaced by those of ``part``."""
 
-    def replaced(array: NDArray[Any], new: NDArray[Any]) -> NDArray[Any]:
+    def replaced(array: Any, new: Any) -> Any:
+        if isinstance(array, tuple):
+            return put(array, rows, new)
         copy = array.copy()
         copy[rows] = new
         return copy

@@ -74,6 +74,7 @@ class Evaluation(NamedTuple):
             "confirmed_tracks": len(self.tracks.ids),
             "false_tracks": false,
             "false_tracks_per_minute": false / minutes if minutes else None,
+            "near_no_target": float(self.idle.false.sum() / self.tracks.there.sum()) if len(self.tracks.ids) else None,
             "duplicates": len(self.idle.duplicates),
             "false_mean": float(self.idle.false.sum(axis=0).mean()),
             "duplicate_mean": float(self.idle.duplicate.sum(axis=0).mean()),

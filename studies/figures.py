@@ -24,9 +24,12 @@ if TYPE_CHECKING:
 #: The decisions of every track that stand, as the summary of a run tells them.
 Decisions: TypeAlias = Mapping[int, Sequence[Mapping[str, Any]]]
 
-_COLOUR = {Status.CONFIRMED: "#0b7a3b", Status.TENTATIVE: "#8a6d1a", Status.DELETED: "#b3261e"}
-#: Of any other status.
-_OTHER = "#6a3d9a"
+_COLOUR = {
+    Status.CONFIRMED: "#0b7a3b",
+    Status.COASTING: "#6a3d9a",
+    Status.TENTATIVE: "#8a6d1a",
+    Status.DELETED: "#b3261e",
+}
 _SENSOR = "#1f4e9e"
 #: Covariance ellipses of a track, at most.
 _ELLIPSES = 12
@@ -53,8 +56,9 @@ def draw_log_lr(sketch: Sketch, decisions: Decisions) -> bytes:
         whole.plot(times, log_lr, color=colour, lw=0.7)
     for axes in (decided, whole):
         _draw_test(axes, sketch, standing)
-    decided.set(ylabel="log LR since the last reset", title=f"{sketch.scenario.name}: until the first decision")
-    whole.set(title="the whole run: confirmed tracks are monitored, their LR reset at log B")
+    decided.set(ylabel="log LR", title=f"{sketch.scenario.name}: until the first decision")
+    monitored = "their LR reset at log B" if sketch.scenario.life is None else "log odds that the target is there now"
+    whole.set(title=f"the whole run: confirmed tracks are monitored, {monitored}")
     if first:
         start_s = min(times[0] for times, _, _ in curves.values())
         decided.set_xlim(start_s, start_s + 1.15 * (max(first.values()) - start_s))
@@ -64,7 +68,7 @@ def draw_log_lr(sketch: Sketch, decisions: Decisions) -> bytes:
 
 def colour_of(status: Status) -> str:
     """Of everything that is drawn of a track."""
-    return _COLOUR.get(status, _OTHER)
+    return _COLOUR[status]
 
 
 def _png(figure: Figure, dpi: int) -> bytes:
@@ -146,11 +150,12 @@ def _extent(sketch: Sketch) -> float:
 
 
 def _with_resets(sketch: Sketch, track: int, history: History) -> tuple[Array, Array]:
-    """Times and log LR with the value that each reset, at a confirmation, threw away."""
+    """Times and log LR with the value that each reset, at a confirmation, threw away; with a life nothing is reset."""
     given = sketch.scenario.hypotheses
     start_s = given[track].start if track < len(given) else history.times_s[0]
     times = np.concatenate([[start_s], np.repeat(history.times_s, 2)])
-    values = np.stack([history.reached, history.log_lr], axis=-1).ravel()
+    reached = history.reached if sketch.scenario.life is None else history.log_lr
+    values = np.stack([reached, history.log_lr], axis=-1).ravel()
     return times, np.concatenate([[0.0], values])
 
 
@@ -192,11 +197,14 @@ def _namesakes(sketch: Sketch, sensor: SensorConfig, stand: Array) -> int:
 
 def _draw_track(axes: Axes, track: int, history: History) -> None:
     colour = colour_of(history.status)
-    axes.plot(history.x[:, 0], history.x[:, 1], color=colour, lw=1.5, zorder=3)
+    for coasting, style in ((False, "-"), (True, ":")):
+        x = np.where((history.coasting == coasting)[:, None], history.x, np.nan)
+        axes.plot(x[:, 0], x[:, 1], color=colour, lw=1.5, ls=style, zorder=3)
     ellipses = min(_ELLIPSES, max(2, len(history.x) // 3))
     for k in np.unique(np.linspace(0, len(history.x) - 1, ellipses).astype(int)):
         axes.add_patch(_ellipse(history.x[k], history.P[k], colour))
-    axes.annotate(f" {track}", tuple(history.x[-1]), color=colour, fontsize=10, zorder=6)
+    seen = f", last plot at {history.supported_s:.0f} s" if history.status == Status.COASTING else ""
+    axes.annotate(f" {track}{seen}", tuple(history.x[-1]), color=colour, fontsize=10, zorder=6)
 
 
 def _ellipse(center: Array, P: Array, colour: str) -> Ellipse:
@@ -215,5 +223,5 @@ def _status_handles(sketch: Sketch) -> list[Patch]:
     rest = [Patch(color="none", label=f"{number} {what}") for what, number in hidden.items() if number]
     return rest + [
         Patch(color=colour_of(status), label=f"{there[status]} {status.name.lower()}")
-        for status in sorted(there, key=lambda status: list(_COLOUR).index(status) if status in _COLOUR else -1)
+        for status in sorted(there, key=list(_COLOUR).index)
     ]

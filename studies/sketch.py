@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from common.config import Scenario
-from common.estimation.gaussian import Array
+from common.estimation.gaussian import Array, BoolArray
 from common.estimation.sprt import Status
 from common.messages import Scan, Tracks
+from common.quantities import NS_PER_S
 
 #: Of more tracks only those that were ever confirmed are drawn, at most so many that have ended: the newest.
 MOST_TRACKS = 200
@@ -71,6 +72,8 @@ class History(NamedTuple):
         log_lr: after it, shape (K,).
         x: fused positions east and north [m], shape (K, 2).
         P: their covariances, shape (K, 2, 2).
+        coasting: whether it was coasting, shape (K,).
+        supported_s: time of the last plot that was its own.
         status: the last one.
         confirmed: whether it ever was.
     """
@@ -80,6 +83,8 @@ class History(NamedTuple):
     log_lr: Array
     x: Array
     P: Array
+    coasting: BoolArray
+    supported_s: float
     status: Status
     confirmed: bool
 
@@ -88,21 +93,33 @@ class _Course:
     """One track so far."""
 
     def __init__(self) -> None:
-        self._rows = ThinnedRows(8, _MOST_TIMES)
-        self._log_lr = self._total = 0.0
+        self._rows = ThinnedRows(9, _MOST_TIMES)
+        self._log_lr = self._total = self._supported_s = 0.0
         self.status, self.confirmed = Status.TENTATIVE, False
 
-    def add(self, time_s: float, status: int, log_lr: float, total: float, place: Sequence[float]) -> None:
-        reached = self._log_lr + (total - self._total)
-        self._rows.add((time_s, reached if isfinite(reached) else _LOWEST, max(log_lr, _LOWEST), *place))
-        self._log_lr, self._total = log_lr, total
+    def add(
+        self, time_s: float, status: int, log_lr: float, total: float, supported_s: float, place: Sequence[float]
+    ) -> None:
+        reached, coasting = self._log_lr + (total - self._total), float(status == Status.COASTING)
+        self._rows.add((time_s, reached if isfinite(reached) else _LOWEST, max(log_lr, _LOWEST), coasting, *place))
+        self._log_lr, self._total, self._supported_s = log_lr, total, supported_s
         self.status = Status(status)
         self.confirmed |= self.status == Status.CONFIRMED
 
     def history(self) -> History:
-        times_s, reached, log_lr, *x, xx, xy, yy = self._rows.rows().T
+        times_s, reached, log_lr, coasting, *x, xx, xy, yy = self._rows.rows().T
         P = np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-2)
-        return History(times_s, reached, log_lr, np.stack(x, axis=-1), P, self.status, self.confirmed)
+        return History(
+            times_s=times_s,
+            reached=reached,
+            log_lr=log_lr,
+            x=np.stack(x, axis=-1),
+            P=P,
+            coasting=coasting > 0.0,
+            supported_s=self._supported_s,
+            status=self.status,
+            confirmed=self.confirmed,
+        )
 
 
 class Sketch:
@@ -134,7 +151,8 @@ class Sketch:
         """Add the picture of the next measurement time."""
         time_s, now = self.scenario.to_seconds(tracks.time_ns), tracks.ids.tolist()
         places = np.column_stack([tracks.x[:, :2], tracks.P[:, 0, 0], tracks.P[:, 0, 1], tracks.P[:, 1, 1]])
-        columns = (tracks.status, tracks.log_lr, tracks.log_lr_total, places)
+        supported_s = (tracks.supported_ns - self.scenario.epoch_ns) / NS_PER_S
+        columns = (tracks.status, tracks.log_lr, tracks.log_lr_total, supported_s, places)
         for track, *values in zip(now, *(column.tolist() for column in columns), strict=True):
             if track not in self._courses:
                 self._courses[track] = _Course()

@@ -30,7 +30,7 @@ SUMMARY = (
     ("  duplicates", "{duplicates}"),
     ("  false", "{false_tracks}"),
     ("  false per minute", "{false_tracks_per_minute:.2f}"),
-    ("  of their time near no target", "{near_no_target:.1%}"),
+    ("  near no target", "{near_no_target:.1%}"),
 )
 
 #: Columns of the targets: heading, and how a fate is said.

@@ -173,6 +173,7 @@ _POSED = (Report, Picked, Scan)
 _POSE = ("velocity", "heading")
 #: Scalars at the end of a message that are left out where all of them are zero.
 _OPTIONAL: dict[type, int] = {Join: 2}
+_MAX_SINGLE = float(np.finfo(np.float32).max)
 #: Ids and epochs that a center could not count on from.
 _MAX_ID, _MAX_EPOCH = 2**31, 2**62
 
@@ -209,6 +210,8 @@ def encode(message: Message, *, rounding: Rounding | None = None) -> bytes:
             )
         if block.axes[-1].endswith("^"):
             array = _holding(array, block.dtype)[..., *_upper(array.shape[-1])]
+        if block.dtype == "<f4":
+            array = np.clip(array, -_MAX_SINGLE, _MAX_SINGLE)  # what is so large is of no use, but a number
         wire = np.ascontiguousarray(array, dtype=block.dtype)
         assert wire.dtype.kind != "u" or (wire == array).all(), f"{block.field} does not fit into {block.dtype}"
         raw.append(wire.tobytes())

@@ -20,11 +20,12 @@ from common.estimation.sprt import Thresholds, thresholds
 from common.fusion_config import FusionConfig, can_use_advice, fusion_faults
 from common.initiation_config import InitiationConfig, initiation_faults
 from common.life_config import LifeConfig
+from common.limits import MAX_SCANS, MAX_SECONDS, MIN_SECONDS
 from common.motion_config import MotionConfig, motion_faults, numbers_per_axis
 from common.quantities import (
     NS_PER_S,
-    WITHIN_RANGE,
     Count,
+    Duration,
     Finite,
     InnerProbability,
     Instant,
@@ -33,6 +34,7 @@ from common.quantities import (
     Positive,
     Probability,
     Seconds,
+    Size,
 )
 from common.sensor_config import BoxConfig as BoxConfig
 from common.sensor_config import DiscConfig as DiscConfig
@@ -105,7 +107,7 @@ class SimulationConfig(Model):
         truth: recorded trajectories of further targets (JSON Lines), path relative to the scenario file.
     """
 
-    duration: Annotated[Positive, WITHIN_RANGE]
+    duration: Duration
     seed: Count = 1
     truth: Path | None = None
 
@@ -155,7 +157,7 @@ class HypothesisConfig(Model):
 
     start: Seconds = 0.0
     state: tuple[Finite, ...]
-    sigma: tuple[Positive, ...]
+    sigma: tuple[Size, ...]
 
     @property
     def density(self) -> Gaussian:
@@ -375,6 +377,7 @@ def _cross_faults(data: Mapping[str, Any]) -> Iterator[str]:
             yield f"target.{i}: give either state or hypothesis"
         elif isinstance(drawn, int) and drawn >= len(hypotheses):
             yield f"target.{i}.hypothesis: {drawn} is not one of the {len(hypotheses)} hypotheses (counted from 0)"
+    yield from _scan_faults(_table(data, "simulation").get("duration"), sensors)
     yield from _decision_faults(_table(data, "decision"))
     kinds = [sensor.get("kind", "position") for sensor in sensors]
     yield from initiation_faults(data.get("initiation"), _table(data, "fusion").get("window", 10.0), kinds)
@@ -442,6 +445,18 @@ def _recording_faults(recording: Mapping[str, Any], sensors: list[Mapping[str, A
     for name in ignored if isinstance(ignored, list) else ():
         if any(sensor.get("name") == name for sensor in sensors):
             yield f"recording.ignore: {name!r} is a sensor of this scenario"
+
+
+def _scan_faults(duration: Any, sensors: list[Mapping[str, Any]]) -> Iterator[str]:
+    """Simulated scans that are too many to be kept."""
+    for i, sensor in enumerate(sensors):
+        interval = sensor.get("scan_interval", 1.0)
+        numbers = isinstance(duration, int | float) and isinstance(interval, int | float)
+        if numbers and interval >= MIN_SECONDS and interval * MAX_SCANS < duration <= MAX_SECONDS:
+            yield (
+                f"sensor.{i}.scan_interval: {interval:g} s makes {duration / interval:.3g} scans in the "
+                f"{duration:g} s of the simulation, expected at most {MAX_SCANS:g}"
+            )
 
 
 def _decision_faults(decision: Mapping[str, Any]) -> Iterator[str]:

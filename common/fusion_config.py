@@ -10,7 +10,7 @@ from pydantic import BaseModel, Field
 from common.estimation.association import Choice, kalman, nearest, normalise
 from common.estimation.mixture import Reduction
 from common.estimation.selection import Selection
-from common.quantities import GateProbability, InnerProbability, NotNegative, Positive
+from common.quantities import Delay, GateProbability, InnerProbability, NotNegative, Positive
 
 CHOICES: dict[str, Choice] = {"kalman": kalman, "nearest": nearest, "pdaf": normalise}
 
@@ -76,15 +76,15 @@ class FusionConfig(BaseModel, extra="forbid", frozen=True):
     association: Literal["factor", "tight", "mirrored"] = "tight"
     terms: Annotated[int, Field(ge=1, le=64, strict=True)] = 1
     feedback: Literal["none", "advice", "reset"] = "none"
-    feedback_delay: NotNegative = 0.0
+    feedback_delay: Delay = 0.0
     filter: Literal["kalman", "nearest", "pdaf", "mht"] | None = None
     mixture: MixtureConfig = MixtureConfig()
     selection: SelectionConfig = SelectionConfig()
     precision: Literal["float64", "float32"] = "float64"
     joint: bool | None = None
     gate_probability: GateProbability = 0.9997
-    hold_back: NotNegative = 0.5
-    window: NotNegative = 10.0
+    hold_back: Delay = 0.5
+    window: Delay = 10.0
 
     @property
     def choice(self) -> Choice | None:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from common.estimation.gaussian import Array
-from common.quantities import Count, GateProbability, Model, NotNegative, Positive, Probability
+from common.quantities import Count, Duration, GateProbability, Model, NotNegative, Probability, Size
 
 
 class InitiationConfig(Model):
@@ -28,11 +28,11 @@ class InitiationConfig(Model):
     """
 
     plots: Literal[1, 2] = 1
-    speed: Positive
-    acceleration: Positive = 1.0
+    speed: Size
+    acceleration: Size = 1.0
     min_speed: NotNegative = 0.0
-    max_speed: Positive | None = None
-    within: Positive = 5.0
+    max_speed: Size | None = None
+    within: Duration = 5.0
     claimed: Probability = 0.5
     gate: GateProbability = 0.99
     merge: NotNegative = 0.5

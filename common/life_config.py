@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from common.quantities import InnerProbability, Model, Positive
+from common.quantities import Duration, InnerProbability, Model, Size
 
 
 class LifeConfig(Model):
@@ -21,8 +21,8 @@ class LifeConfig(Model):
             field of view.
     """
 
-    stay: Positive | None = None
-    coasting_after: Positive | None = None
-    lost_after: Positive | None = None
+    stay: Duration | None = None
+    coasting_after: Duration | None = None
+    lost_after: Duration | None = None
     lost_below: InnerProbability = 0.05
-    lost_sigma: Positive | None = None
+    lost_sigma: Size | None = None

@@ -23,8 +23,16 @@ MIN_SIGMA = 1e-6
 MAX_ESTIMATE = 1e6 * MAX_VALUE
 #: Times are this close to the scenario's epoch, so that nanoseconds since 1970 fit into 64 bits [s].
 MAX_SECONDS = 4e9
+#: No time between two events of a file is shorter [s].
+MIN_SECONDS = 1e-6
+#: Scans of a simulated sensor: they are kept in memory.
+MAX_SCANS = 10**7
 #: Plots of a scan: their places are sent in 16 bits.
 MAX_PLOTS = 2**16 - 1
+#: Mean false plots of a scan, at least 60 standard deviations below ``MAX_PLOTS``, and the smallest that is not none.
+MAX_FALSE_PLOTS, MIN_FALSE_PLOTS = 5e4, 1e-12
+#: No other number of a file is larger, or smaller without being 0: counts, ratios, bits in a second.
+MAX_NUMBER = 1e15
 #: Whole numbers by which lines name targets and tracks: exact in JSON wherever it is read.
 MAX_ID = 10**15
 #: Written with few digits or in single precision, 2 pi and pi / 2 may come out a little too large.

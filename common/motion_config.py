@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 
 from common.estimation.imm import Imm
 from common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Kinematic, Motion
-from common.quantities import Finite, NotNegative, Positive
+from common.quantities import Duration, Finite, NotNegative
 
 Model: TypeAlias = Literal["cv", "ca", "ct"]
 Dimensions: TypeAlias = Literal[2, 3]
@@ -50,7 +50,7 @@ class MotionConfig(BaseModel, extra="forbid", frozen=True):
     dimensions: Dimensions = 2
     psd: NotNegative | None = None
     turn_rate: Finite | None = None
-    sojourn: Positive | None = None
+    sojourn: Duration | None = None
     models: Annotated[tuple[ModelConfig, ...], Field(min_length=2)] | None = None
 
     def build(self) -> Motion:

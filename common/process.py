@@ -13,6 +13,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
+import numpy as np
 from cyclopts import App, Parameter, Token, validators
 
 from common.config import Network, Scenario, load_network
@@ -122,6 +123,12 @@ def _until_closed(stop: Callable[[], None]) -> None:
     stop()
 
 
+_TOO_FAR_APART = (
+    "double precision cannot hold a density of this network; standard deviations, speeds, accelerations and times "
+    "between scans are too many orders apart"
+)
+
+
 def main(app: App, tokens: list[str] | None = None) -> Any:
     """Run a command line; our own errors end with one clear message and exit code 1.
 
@@ -138,6 +145,8 @@ def main(app: App, tokens: list[str] | None = None) -> Any:
         return result
     except WaldnetError as error:
         print(error, file=sys.stderr)  # noqa: T201 (what a user is told)
+    except np.linalg.LinAlgError as error:
+        print(f"{error}: {_TOO_FAR_APART}", file=sys.stderr)  # noqa: T201
     except BrokenPipeError:
         # Whoever read our output has seen enough; nothing is left to say, not even at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -8,7 +8,18 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from common.limits import FULL_CIRCLE, MAX_PLOTS, MAX_SECONDS, ZENITH
+from common.limits import (
+    FULL_CIRCLE,
+    MAX_FALSE_PLOTS,
+    MAX_NUMBER,
+    MAX_PLOTS,
+    MAX_SECONDS,
+    MAX_VALUE,
+    MIN_FALSE_PLOTS,
+    MIN_SECONDS,
+    MIN_SIGMA,
+    ZENITH,
+)
 
 NS_PER_S = 1_000_000_000
 
@@ -53,6 +64,17 @@ def _finite(value: float) -> float:
     if not np.isfinite(value):
         raise ValueError(f"{value:g} is not finite")
     return value
+
+
+def _within(low: float, high: float) -> AfterValidator:
+    """Numbers that can be computed with: their squares and products neither overflow nor vanish."""
+
+    def check(value: float) -> float:
+        if not low <= value <= high:
+            raise ValueError(f"{value:g} is not between {low:g} and {high:g}")
+        return value
+
+    return AfterValidator(check)
 
 
 def _angle(value: float) -> float:
@@ -112,16 +134,23 @@ _NUMBER = Field(strict=True)
 Probability = Annotated[float, _NUMBER, AfterValidator(_probability)]
 InnerProbability = Annotated[float, _NUMBER, AfterValidator(_inner_probability)]
 GateProbability = Annotated[float, _NUMBER, AfterValidator(_gate_probability)]
-Positive = Annotated[float, _NUMBER, AfterValidator(_positive)]
-NotNegative = Annotated[float, _NUMBER, AfterValidator(_not_negative)]
-Finite = Annotated[float, _NUMBER, AfterValidator(_finite)]
+Positive = Annotated[float, _NUMBER, AfterValidator(_positive), _within(1.0 / MAX_NUMBER, MAX_NUMBER)]
+NotNegative = Annotated[float, _NUMBER, AfterValidator(_not_negative), _within(0.0, MAX_NUMBER)]
+#: Coordinates, their derivatives, and other numbers of that order [m, m/s, m/s^2, rad/s].
+Finite = Annotated[float, _NUMBER, AfterValidator(_finite), _within(-MAX_VALUE, MAX_VALUE)]
+#: Standard deviations, lengths and speeds [m, rad, m/s, m/s^2].
+Size = Annotated[float, _NUMBER, AfterValidator(_positive), _within(MIN_SIGMA, MAX_VALUE)]
+Decibels = Annotated[float, _NUMBER, AfterValidator(_finite), _within(-300.0, 300.0)]
+#: Areas and volumes [m^2, m^3].
+Volume = Annotated[float, _NUMBER, AfterValidator(_positive), _within(MIN_SIGMA**3, MAX_VALUE**3)]
+#: Times that pass [s].
+Duration = Annotated[float, _NUMBER, AfterValidator(_positive), _within(MIN_SECONDS, MAX_SECONDS)]
+Delay = Annotated[float, _NUMBER, AfterValidator(_not_negative), _within(0.0, MAX_SECONDS)]
 Angle = Annotated[float, _NUMBER, AfterValidator(_angle)]
 Span = Annotated[float, _NUMBER, AfterValidator(_span)]
 Elevation = Annotated[float, _NUMBER, AfterValidator(_elevation)]
-FalsePlots = Annotated[float, _NUMBER, AfterValidator(_false_plots)]
-#: For a number that is seconds from the epoch too.
-WITHIN_RANGE = AfterValidator(_seconds)
-Seconds = Annotated[float, _NUMBER, AfterValidator(_finite), WITHIN_RANGE]
+FalsePlots = Annotated[float, _NUMBER, AfterValidator(_false_plots), _within(MIN_FALSE_PLOTS, MAX_FALSE_PLOTS)]
+Seconds = Annotated[float, _NUMBER, AfterValidator(_finite), AfterValidator(_seconds)]
 Count = Annotated[int, Field(ge=0, strict=True)]
 Instant = Annotated[datetime, BeforeValidator(_no_number), AfterValidator(_instant)]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.-]+$")]

@@ -24,8 +24,10 @@ from common.estimation.sigma_points import SigmaPoint
 from common.estimation.visibility import Visibility
 from common.limits import PlotLimits, plot_limits
 from common.quantities import (
-    WITHIN_RANGE,
     Angle,
+    Decibels,
+    Delay,
+    Duration,
     Elevation,
     FalsePlots,
     Finite,
@@ -35,7 +37,9 @@ from common.quantities import (
     NotNegative,
     Positive,
     Probability,
+    Size,
     Span,
+    Volume,
 )
 
 #: Range rates of false plots reach so far unless the file says otherwise [m/s].
@@ -57,7 +61,7 @@ class EverywhereConfig(Model):
     """
 
     shape: Literal["everywhere"]
-    area: Positive | None = None
+    area: Volume | None = None
 
     def build(self, dimensions: int) -> FieldOfView:
         """The field of view."""
@@ -72,7 +76,7 @@ class BoxConfig(Model):
     """A box with full side lengths ``size`` [m]; without a center it moves and turns with the sensor."""
 
     shape: Literal["box"]
-    size: tuple[Positive, ...]
+    size: tuple[Size, ...]
     center: tuple[Finite, ...] | None = None
 
     def build(self, dimensions: int) -> FieldOfView:  # noqa: ARG002 (the size tells)
@@ -88,7 +92,7 @@ class DiscConfig(Model):
     """A disc, in 3-D a ball, of ``radius`` [m]; without a center it moves with the sensor."""
 
     shape: Literal["disc"]
-    radius: Positive
+    radius: Size
     center: tuple[Finite, ...] | None = None
 
     def build(self, dimensions: int) -> FieldOfView:
@@ -112,7 +116,7 @@ class SectorConfig(Model):
     """
 
     shape: Literal["sector"]
-    radius: Positive
+    radius: Size
     inner: NotNegative = 0.0
     direction: Angle
     width: Span
@@ -154,8 +158,8 @@ class SwerlingConfig(Model):
 
     model: Literal["swerling"]
     p_fa: InnerProbability
-    snr_db: Finite
-    at_range: Positive
+    snr_db: Decibels
+    at_range: Size
 
     def build(self) -> Detection:
         """The detection model."""
@@ -170,7 +174,7 @@ class NotchConfig(Model):
     """
 
     model: Literal["notch"]
-    mdv: Positive
+    mdv: Size
 
     def build(self) -> Detection:
         """The detection model."""
@@ -188,8 +192,8 @@ class VisibilityConfig(Model):
         hidden_for: mean time that it then stays hidden, and is not detected [s].
     """
 
-    visible_for: Positive
-    hidden_for: Positive
+    visible_for: Duration
+    hidden_for: Duration
 
     def build(self) -> Visibility:
         """The visibility model."""
@@ -206,8 +210,8 @@ class ClutterMapConfig(Model):
         start_below: a plot starts a track only where false plots are less than so many times as dense as on average.
     """
 
-    cell: Positive
-    memory: Positive = 60.0
+    cell: Size
+    memory: Duration = 60.0
     shape: Positive = 0.1
     start_below: Positive = 10.0
 
@@ -245,18 +249,18 @@ class SensorConfig(Model):
     velocity: tuple[Finite, ...] | None = None
     heading: Angle | None = None
     azimuth: Literal["north", "heading"] = "north"
-    sigma: tuple[Positive, ...]
+    sigma: tuple[Size, ...]
     p_d: Probability | None = None
     detection: DetectionConfig = ConstantConfig()
     visibility: VisibilityConfig | None = None
     false_plots: FalsePlots
     clutter_map: ClutterMapConfig | None = None
-    max_speed: Positive | None = None
+    max_speed: Size | None = None
     update: Literal["ekf", "sigma-point"] = "ekf"
     field_of_view: FieldOfViewConfig
-    scan_interval: Positive = 1.0
-    spacing: NotNegative = 0.0
-    first_scan: Annotated[NotNegative, WITHIN_RANGE] | None = None
+    scan_interval: Duration = 1.0
+    spacing: Delay = 0.0
+    first_scan: Delay | None = None
 
     def build(self, motion: Motion) -> Sensor:
         """The sensor model for states of a motion model."""

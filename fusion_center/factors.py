@@ -19,6 +19,7 @@ from common.estimation.gaussian import (
     are_positive_definite,
     log_sum_exp,
     moments,
+    settled_whitener,
     whitener,
 )
 from common.estimation.imm import Imm, Modes, predict_modes
@@ -319,7 +320,8 @@ class Fuser:
         live = kept.times_ns < t_ns
         moving = take(kept, live)
         log_a, factors, network_P = self._predict(moving, t_ns)
-        whitened = Whitened(factors.x, *whitener(factors.P))
+        P, *parts = settled_whitener(factors.P)
+        factors, whitened = Gaussian(factors.x, P), Whitened(factors.x, *parts)
         product = multiply_mixtures(log_a, whitened)
         return Expected(picture, t_ns, kept, live, moving, log_a, factors, whitened, product, network_P)
 

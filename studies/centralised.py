@@ -115,7 +115,9 @@ class Centralised:
         # The last report has the evidence of all, and the tracks after all.
         expected, before = self.fuser.expect(state.picture, time_ns), state.picture
         whole = reports[-1]._replace(supported=np.any([report.supported for report in reports], axis=0))
-        moved = self.fuser.advance(expected, {0: Heard.of(whole)})
+        heard = self.fuser.heard(whole)
+        assert isinstance(heard, Heard), "it is a report of this scenario"
+        moved = self.fuser.advance(expected, {0: heard})
         told = {scan.sensor: scan.pose for scan in scans}
         poses = tuple(told.get(name, pose) for name, pose in zip(self.names, state.poses, strict=True))
         picture, decisions = self.life.judge(moved, time_ns, poses)

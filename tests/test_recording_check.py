@@ -270,7 +270,7 @@ DUBIOUS: list[tuple[dict[str, Any], str]] = [
         "degrees were meant, write 0.03491.",
     ),
     ({"sensor": [sensor_table(kind="bearing", sigma=[1.0], field_of_view=VIEW)]}, "known to 1 rad"),
-    ({"sensor": [sensor_table(false_plots=6e4)]}, "no test can decide"),
+    ({"sensor": [sensor_table(false_plots=5e4)]}, "no test can decide"),
     ({"sensor": [sensor_table(sigma=[9000.0, 9000.0])]}, "no test can decide"),
     ({"sensor": [sensor_table(kind="polar", sigma=[3000.0, 0.4], false_plots=20.0)]}, "no test can decide"),
     (

@@ -26,10 +26,10 @@ from common.estimation.gaussian import (
     Gaussian,
     identity,
     joseph,
+    settled_whitener,
     squared_norm,
     symmetric,
     times_transposed,
-    whitener,
 )
 from common.estimation.sensing import Linearised
 
@@ -143,7 +143,7 @@ def expect(predicted: Gaussian, sensor: Linearised, clutter: Clutter) -> Expecte
     """
     PH = times_transposed(predicted.P, sensor.H)
     S = symmetric(times_transposed(PH.mT, sensor.H)) + sensor.R
-    white, half_log_det = whitener(S)
+    _, white, half_log_det = settled_whitener(S)
     m = white.shape[-1]
     W = times_transposed(PH, white)
     p_miss, p_hit, edge = _in_view(Gaussian(predicted.x[-1], predicted.P[-1]), clutter)

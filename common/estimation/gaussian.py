@@ -97,9 +97,12 @@ def cholesky(P: Array) -> Array:
     """Lower Cholesky factors of ``P``, shape (..., n, n).
 
     Raises:
-        numpy.linalg.LinAlgError: when a matrix is not positive definite.
+        numpy.linalg.LinAlgError: when a matrix is not positive definite, by more than rounding.
     """
-    L: Array = np.linalg.cholesky(P).astype(np.float64, copy=False)
+    try:
+        L: Array = np.linalg.cholesky(P).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError:
+        L = np.asarray(np.linalg.inv(settled_whitener(P)[1]), np.float64)
     return L
 
 
@@ -181,9 +184,42 @@ def _whitener_of_few(P: Array) -> tuple[Array, Array]:
     return W, -np.log(W.diagonal(axis1=-2, axis2=-1)).sum(axis=-1)
 
 
+def settled_whitener(P: Array) -> tuple[Array, Array, Array]:
+    """``whitener`` of covariances, or of information matrices, that are positive definite but for rounding.
+
+    Where a sharp position and a vague velocity are predicted over a long time, their correlation is 1 to all digits.
+    Such a matrix gets a larger diagonal, by the smallest part of it that helps: a density that is a little wider.
+
+    Args:
+        P: shape (..., n, n).
+
+    Returns:
+        the matrices, as they are where they are positive definite; and what ``whitener`` makes of them.
+
+    Raises:
+        numpy.linalg.LinAlgError: when a matrix is not positive definite by far, or not finite.
+    """
+    try:
+        return P, *whitener(P)
+    except np.linalg.LinAlgError:
+        flat = P.reshape(-1, *P.shape[-2:]).copy()
+        for part in 2.0 ** np.arange(-50, -19, 3):
+            bad = ~are_positive_definite(flat)
+            flat[bad] += part * flat[bad] * identity(P.shape[-1])
+        P = flat.reshape(P.shape)
+        return P, *whitener(P)
+
+
 def are_positive_definite(P: Array) -> BoolArray:
     """Which covariances ``whitener`` can take apart, shape (N, n, n) to (N,), however many there are with them."""
     good = np.ones(len(P), np.bool_)
+    try:
+        whitener(P)
+    except np.linalg.LinAlgError:
+        pass
+    else:
+        if len(P) > _FEW:
+            return good
     for i, matrix in enumerate(P):
         try:
             # A few and many go different ways.
@@ -279,7 +315,7 @@ def multiply(factors: Whitened, members: BoolArray | None = None) -> Product:
         W, half = W * members[..., None, None], half * members
     # P^-1 = W'W: with the rows of all sensors one below the other, the sum over them is one product.
     rows = W.reshape(*batch, n_sensors * n, n)
-    V, half_information = whitener(gram(rows))
+    _, V, half_information = settled_whitener(gram(rows))
     P = gram(V)
     # Relative to the first factor, so that large coordinates cost no digits.
     reference = x[..., :1, :]

@@ -10,12 +10,13 @@ from common.estimation.gaussian import (
     Array,
     BoolArray,
     Gaussian,
+    gram,
     joseph,
     quadratic,
+    settled_whitener,
     squared_norm,
     symmetric,
     times_transposed,
-    whitener,
 )
 from common.estimation.motion import Motion, predict
 from common.estimation.sensing import Measurement
@@ -51,8 +52,16 @@ def from_plots(z: Array, measurement: Measurement, stand: Array, spread: Array) 
     information[range(d, n), range(d, n)] = spread**-2.0
     HR = np.linalg.solve(seen.R, np.broadcast_to(seen.H, (len(z), *seen.H.shape[-2:]))).mT
     known: Array = HR @ seen.H + information + _NOTHING * np.eye(n)
-    P = symmetric(np.linalg.inv(symmetric(known)).astype(np.float64))
+    P = _inverse(symmetric(known))
     return Gaussian(x + np.matvec(P @ HR, innovations(z, seen.z, seen.angular)), P)
+
+
+def _inverse(information: Array) -> Array:
+    """Covariances of information matrices, shape (M, n, n)."""
+    try:
+        return symmetric(np.linalg.inv(information).astype(np.float64))
+    except np.linalg.LinAlgError:
+        return gram(settled_whitener(information)[1])
 
 
 def with_second(
@@ -75,7 +84,7 @@ def with_second(
     predicted = predict(first, motion.transition(dt), motion.noise(dt))
     seen = measurement.linearise(predicted, stand)
     PH = times_transposed(predicted.P, seen.H)
-    white, _ = whitener(symmetric(times_transposed(PH.mT, seen.H)) + seen.R)
+    _, white, _ = settled_whitener(symmetric(times_transposed(PH.mT, seen.H)) + seen.R)
     w = np.matvec(white, innovations(z, seen.z, seen.angular))
     gain = times_transposed(PH, white)
     P = joseph(predicted.P, gain @ white, seen.H, seen.R)

@@ -17,8 +17,8 @@ from common.estimation.gaussian import (
     moments,
     multiply,
     quadratic,
+    settled_whitener,
     squared_norm,
-    whitener,
 )
 
 #: Products kept from sensor to sensor.
@@ -75,7 +75,7 @@ def multiply_mixtures(log_a: Array, terms: Whitened, keep: int = KEEP) -> Produc
             lost = (total - log_sum_exp(value))[:, None]
             product, value = product._replace(zeta=product.zeta + lost), value + lost
     log_c = log_sum_exp(value)
-    W, _ = whitener(product.J)
+    _, W, _ = settled_whitener(product.J)
     P = gram(W)
     mixture_density = Gaussian(reference[:, None] + np.matvec(P, product.h), P)
     return Product(moments(np.exp(value - log_c[:, None]), mixture_density), log_c)

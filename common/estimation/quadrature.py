@@ -17,6 +17,8 @@ CERTAIN = 8.5
 #: Largest difference between a panel and its two halves; the halves are better by orders of magnitude.
 _TOLERANCE = 1e-9
 _BISECTIONS = 30
+#: A function that needs so many panels at once is rough everywhere by rounding, and more do not help.
+_CROWDED = 256
 #: Panels evaluated at once: bounds the memory whatever the batch.
 _CHUNK = 1024
 # Enough for a smooth edge within +-8.5 sigmas, so that most integrals need no bisection.
@@ -72,7 +74,8 @@ def integrate(integrand: Integrand, breaks: Array) -> Array:
     for _ in range(_BISECTIONS):
         middle = 0.5 * (a + b)
         left, right = _gauss(integrand, owner, a, middle), _gauss(integrand, owner, middle, b)
-        rough = np.abs(left + right - whole) > _TOLERANCE
+        crowded = np.bincount(owner, minlength=total.size) > _CROWDED
+        rough = (np.abs(left + right - whole) > _TOLERANCE) & ~crowded[owner]
         total += np.bincount(owner[~rough], (left + right)[~rough], total.size)
         if not rough.any():
             break

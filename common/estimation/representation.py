@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from common.estimation.gaussian import Array, Gaussian, gram, joseph, symmetric, times_transposed, whitener
+from common.estimation.gaussian import (
+    Array,
+    Gaussian,
+    gram,
+    joseph,
+    settled_whitener,
+    symmetric,
+    times_transposed,
+)
 from common.estimation.motion import Motion, predict
 
 
@@ -63,9 +71,9 @@ def globalise(P: Array) -> Global:
         theory.md §4; F. Govaers, Sequential likelihood ratio test based on the distributed Kalman filter (2015).
     """
     n_sensors = P.shape[-3]
-    W, _ = whitener(P)
+    P, W, _ = settled_whitener(P)
     information = gram(W)
-    V, _ = whitener(information.sum(axis=-3))
+    _, V, _ = settled_whitener(information.sum(axis=-3))
     common = symmetric(n_sensors * gram(V))
     return Global(common, common[..., None, :, :] @ information)
 
@@ -82,5 +90,5 @@ def shrink(P: Array, H: Array, R: Array) -> Array:
         updated covariances, shape (..., n, n).
     """
     PH = times_transposed(P, H)
-    W, _ = whitener(symmetric(times_transposed(PH.mT, H)) + R)
+    _, W, _ = settled_whitener(symmetric(times_transposed(PH.mT, H)) + R)
     return joseph(P, PH @ gram(W), H, R)

@@ -18,7 +18,15 @@ from typing import NamedTuple
 import numpy as np
 
 from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array, Gaussian, gram, log_sum_exp, symmetric, times_transposed, whitener
+from common.estimation.gaussian import (
+    Array,
+    Gaussian,
+    gram,
+    log_sum_exp,
+    settled_whitener,
+    symmetric,
+    times_transposed,
+)
 from common.estimation.mixture import Ancestry, Mixture
 from common.estimation.motion import Motion
 
@@ -102,7 +110,7 @@ def backward(filtered: Gaussian, F: Array, Q: Array, later: Gaussian) -> Gaussia
     """
     x, P = filtered
     FP = F @ P
-    W, _ = whitener(symmetric(FP @ F.mT) + Q)
+    _, W, _ = settled_whitener(symmetric(FP @ F.mT) + Q)
     G = np.ascontiguousarray((gram(W) @ FP).mT)
     # I - G F leaves of the filtered deviation what the later state does not tell.
     rest = np.eye(x.shape[-1]) - G @ F

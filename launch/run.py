@@ -20,6 +20,7 @@ from common.inbox import Exited, Heard, Inbox, Incoming, Missed, Present, Said, 
 from common.messages import NEVER, Clock, Decision, Keys, Scan, Tracks, sensor_of
 from common.process import stopped_by_signals
 from common.transport import Bus, open_zenoh
+from launch.left_out import left_out
 from launch.processes import Children, LaunchError, describe_exit
 from launch.status import LiveStatus
 from studies.inputs import Source
@@ -245,6 +246,8 @@ def execute(order: Order, console: Console) -> None:
             failures.append(describe(error))
         finally:
             report = folder.finish({"seed": order.seed, "speed": order.speed or "max"})
+            for line in left_out(order.out / "logs"):
+                console.print(line, soft_wrap=True)
             _tell(folder, report, console)
         if failures := [*failures, *report.failures]:
             raise LaunchError(f"{failures[0]}; the report is smaller for it, what it holds can be read")

@@ -19,6 +19,7 @@ from common.limits import MAX_ESTIMATE, MAX_VALUE
 from common.messages import Begin, Picked, Report, Scan
 from fusion_center.initiation import Initiation
 from launch.cli import app
+from launch.left_out import left_out
 from scenarios.plots import read_plots
 from scenarios.world import simulate_all
 from studies.replay import Replay
@@ -182,6 +183,25 @@ def test_a_bad_plot_among_those_that_matter_is_left_out_alone() -> None:
     without.tell(picked(without, 2.0, np.array([[10.0, 5.0], [-30.0, 20.0]])))
     assert same(stage.tracks, without.tracks)
     assert stage.state.counts == without.state.counts._replace(unusable_plots=1)
+
+
+def test_a_run_says_what_its_logs_say_was_left_out(tmp_path: Path) -> None:
+    center = {
+        "event": "ended",
+        "refused": {"b": {"wrong dimensions": 3, "older epoch": 1}, "a": {"not joined": 2}},
+        "dropped": {"unusable tracks": 4, "late report": 5},
+    }
+    (tmp_path / "center.log").write_text('{"event": "waiting"}\n' + json.dumps(center) + "\nnot JSON\n")
+    (tmp_path / "a.log").write_text(json.dumps({"event": "ended", "dropped": {"unusable plots": 12}}) + "\n")
+    (tmp_path / "b.log").write_text('{"event": "tracks started"}\n[]\n"ended"\n{"event": "end')
+    assert list(left_out(tmp_path)) == [
+        "a: left out 12 unusable plots",
+        "center: refused 2 of a: not joined",
+        "center: refused 1 of b: older epoch",
+        "center: refused 3 of b: wrong dimensions",
+        "center: left out 4 unusable tracks",
+    ]
+    assert list(left_out(tmp_path / "none")) == []
 
 
 def test_replay_says_what_was_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -135,8 +135,10 @@ def test_float32_reports_hardly_change_log_lr_in_1000_scans() -> None:
     row = compare("four-radars", 1000)
     assert row["scans"] == 1000
     assert row["largest_log_lr"] > 1000.0
-    assert 0.0 < row["log_lr_difference"] < 0.01
-    assert 0.0 < row["position_difference_m"] < 0.1
+    # Hypotheses without a target go on for ever here, and log LR of some falls to -100,000.
+    assert 0.0 < row["log_lr_difference"] < 1e-5 * row["largest_log_lr"]
+    # And their positions are known to some hundred metres only.
+    assert 0.0 < row["position_difference_m"] < 5.0
 
 
 def test_a_network_with_float32_reports_says_what_replay_says(tmp_path: Path) -> None:

@@ -47,19 +47,19 @@ lock: ## resolve the locks anew from pyproject.toml (needs uv)
 	uv pip compile pyproject.toml requirements/build.in --extra test -c requirements/user.lock --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-header --quiet -o requirements/test.lock
 
 bench: $(VENV)/test.stamp ## speed of the estimator beside Stone Soup, and of the steps
-	$(BIN)/python benchmarks/estimator.py
-	$(BIN)/python benchmarks/steps.py
+	$(BIN)/python waldnet/benchmarks/estimator.py
+	$(BIN)/python waldnet/benchmarks/steps.py
 
 figures: $(VENV)/test.stamp ## measure all figures of docs/performance.md and many-targets.md anew (half an hour, needs root)
-	$(BIN)/python -m benchmarks.figures docs/performance.md
-	$(BIN)/python -m benchmarks.figures docs/many-targets.md bench
+	$(BIN)/python -m waldnet.benchmarks.figures docs/performance.md
+	$(BIN)/python -m waldnet.benchmarks.figures docs/many-targets.md bench
 
 studies: $(VENV)/test.stamp ## play all studies of docs/studies.md and the pairs of many-targets.md anew (an hour and a half)
-	$(BIN)/python -m benchmarks.figures docs/studies.md
-	$(BIN)/python -m benchmarks.figures docs/many-targets.md pairs
+	$(BIN)/python -m waldnet.benchmarks.figures docs/studies.md
+	$(BIN)/python -m waldnet.benchmarks.figures docs/many-targets.md pairs
 
 real: $(VENV)/test.stamp ## track the recorded scenarios of docs/real-runs.md anew, with waldnet and a peer (a quarter of an hour)
-	$(BIN)/python -m benchmarks.figures docs/real-runs.md
+	$(BIN)/python -m waldnet.benchmarks.figures docs/real-runs.md
 
 clean: ## remove what was made
 	rm -rf $(VENV) runs .mypy_cache .ruff_cache .pytest_cache .import_linter_cache .hypothesis build *.egg-info

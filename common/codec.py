@@ -17,9 +17,9 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from common.errors import DecodeError, VersionError
-from common.estimation.sprt import Status
-from common.messages import (
+from waldnet.common.errors import DecodeError, VersionError
+from waldnet.common.estimation.sprt import Status
+from waldnet.common.messages import (
     Advice,
     Begin,
     Clock,

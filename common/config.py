@@ -13,16 +13,16 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 from pydantic_core import ErrorDetails
 
-from common.errors import ConfigError
-from common.estimation.gaussian import Gaussian
-from common.estimation.representation import Share
-from common.estimation.sprt import Thresholds, thresholds
-from common.fusion_config import FusionConfig, can_use_advice, fusion_faults
-from common.initiation_config import InitiationConfig, initiation_faults
-from common.life_config import LifeConfig
-from common.limits import MAX_SCANS, MAX_SECONDS, MIN_SECONDS
-from common.motion_config import MotionConfig, motion_faults, numbers_per_axis
-from common.quantities import (
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.representation import Share
+from waldnet.common.estimation.sprt import Thresholds, thresholds
+from waldnet.common.fusion_config import FusionConfig, can_use_advice, fusion_faults
+from waldnet.common.initiation_config import InitiationConfig, initiation_faults
+from waldnet.common.life_config import LifeConfig
+from waldnet.common.limits import MAX_SCANS, MAX_SECONDS, MIN_SECONDS
+from waldnet.common.motion_config import MotionConfig, motion_faults, numbers_per_axis
+from waldnet.common.quantities import (
     NS_PER_S,
     Count,
     Duration,
@@ -36,11 +36,11 @@ from common.quantities import (
     Seconds,
     Size,
 )
-from common.sensor_config import BoxConfig as BoxConfig
-from common.sensor_config import DiscConfig as DiscConfig
-from common.sensor_config import SectorConfig as SectorConfig
-from common.sensor_config import SensorConfig as SensorConfig
-from common.sensor_config import sensor_faults, wrong_length
+from waldnet.common.sensor_config import BoxConfig as BoxConfig
+from waldnet.common.sensor_config import DiscConfig as DiscConfig
+from waldnet.common.sensor_config import SectorConfig as SectorConfig
+from waldnet.common.sensor_config import SensorConfig as SensorConfig
+from waldnet.common.sensor_config import sensor_faults, wrong_length
 
 #: What nodes and center must have in common.
 _COMMON = {"epoch", "motion", "initiation", "life", "fusion", "sensors"}

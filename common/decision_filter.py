@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.config import Scenario
-from common.estimation.sprt import Status
-from common.messages import Decision, Tracks
-from common.quantities import NS_PER_S
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.sprt import Status
+from waldnet.common.messages import Decision, Tracks
+from waldnet.common.quantities import NS_PER_S
 
 
 class DecisionFilter:

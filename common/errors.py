@@ -11,7 +11,7 @@
     ├── TruthError           a file of true positions is wrong; file and line named
     ├── EvaluationError      a run to evaluate is wrong; file and line named
     ├── StudyError           workers of a study died, or are of another version
-    └── LaunchError          a process of a run did not start, or died (launch/processes.py)
+    └── LaunchError          a process of a run did not start, or died (waldnet/launch/processes.py)
 """
 
 from __future__ import annotations

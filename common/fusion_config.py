@@ -7,10 +7,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, Field
 
-from common.estimation.association import Choice, kalman, nearest, normalise
-from common.estimation.mixture import Reduction
-from common.estimation.selection import Selection
-from common.quantities import Delay, GateProbability, InnerProbability, NotNegative, Positive
+from waldnet.common.estimation.association import Choice, kalman, nearest, normalise
+from waldnet.common.estimation.mixture import Reduction
+from waldnet.common.estimation.selection import Selection
+from waldnet.common.quantities import Delay, GateProbability, InnerProbability, NotNegative, Positive
 
 CHOICES: dict[str, Choice] = {"kalman": kalman, "nearest": nearest, "pdaf": normalise}
 

@@ -1,6 +1,7 @@
 """Health of a process: it answers on a local socket, from its own loop, so that one that is stuck stays silent.
 
-``python -m common.health PATH [--max-age S]`` asks. Standard library only: small machines ask every few seconds.
+``python -m waldnet.common.health PATH [--max-age S]`` asks.
+Standard library only: small machines ask every few seconds.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, TypeAlias
 
-from common.errors import TransportError
+from waldnet.common.errors import TransportError
 
 Health: TypeAlias = dict[str, Any]
 Answer: TypeAlias = Callable[[Health], None]
@@ -120,7 +121,7 @@ def main(words: list[str]) -> int:
         case [path] | [path, "--max-age", _]:
             pass
         case _:
-            print("usage: python -m common.health PATH [--max-age SECONDS]", file=sys.stderr)
+            print("usage: python -m waldnet.common.health PATH [--max-age SECONDS]", file=sys.stderr)
             return 2
     try:
         max_age_s = float(words[2]) if len(words) > 1 else None

@@ -5,8 +5,8 @@ from __future__ import annotations
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeAlias
 
-from common.clock import now_ns
-from common.health import Answer
+from waldnet.common.clock import now_ns
+from waldnet.common.health import Answer
 
 
 class Heard(NamedTuple):

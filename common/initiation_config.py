@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from common.estimation.gaussian import Array
-from common.quantities import Count, Duration, GateProbability, Model, NotNegative, Probability, Size
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.quantities import Count, Duration, GateProbability, Model, NotNegative, Probability, Size
 
 
 class InitiationConfig(Model):

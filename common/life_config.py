@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from common.quantities import Duration, InnerProbability, Model, Size
+from waldnet.common.quantities import Duration, InnerProbability, Model, Size
 
 
 class LifeConfig(Model):

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array, BoolArray
-from common.estimation.pose import SensorPose
+from waldnet.common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.pose import SensorPose
 
 #: No coordinate, distance, speed, acceleration or standard deviation is larger [m, m/s, m/s^2].
 MAX_VALUE = 1e9

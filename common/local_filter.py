@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import Scenario
-from common.estimation.association import (
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.association import (
     Choice,
     Clutter,
     Expected,
@@ -18,16 +18,16 @@ from common.estimation.association import (
     weights_alone,
     within_reach,
 )
-from common.estimation.detection import Notch
-from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
-from common.estimation.imm import Imm, Modes, predict_modes, predict_probabilities
-from common.estimation.joint import joint
-from common.estimation.mixture import Mixture, Reduction, step, step_with, terms
-from common.estimation.motion import Motion
-from common.estimation.notch import hypotheses, merged
-from common.estimation.representation import Share
-from common.estimation.sensing import Sensor
-from common.estimation.visibility import seen
+from waldnet.common.estimation.detection import Notch
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
+from waldnet.common.estimation.imm import Imm, Modes, predict_modes, predict_probabilities
+from waldnet.common.estimation.joint import joint
+from waldnet.common.estimation.mixture import Mixture, Reduction, step, step_with, terms
+from waldnet.common.estimation.motion import Motion
+from waldnet.common.estimation.notch import hypotheses, merged
+from waldnet.common.estimation.representation import Share
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.estimation.visibility import seen
 
 #: The honest prior and noise of the association filter.
 HONEST = Share(1.0)

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
-from common.errors import TransportError
-from common.transport import Bus, Deliver, DeliverMiss, DeliverPresence, KeyExpr, Publisher, explained
+from waldnet.common.errors import TransportError
+from waldnet.common.transport import Bus, Deliver, DeliverMiss, DeliverPresence, KeyExpr, Publisher, explained
 
 
 class MemoryNetwork:

@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from common.estimation.gaussian import Array, BoolArray
-from common.estimation.pose import SensorPose
-from common.estimation.sprt import StatusArray
+from waldnet.common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sprt import StatusArray
 
 IntArray = NDArray[np.int64]
 

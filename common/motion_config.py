@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import BaseModel, Field
 
-from common.estimation.imm import Imm
-from common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Kinematic, Motion
-from common.quantities import Duration, Finite, NotNegative
+from waldnet.common.estimation.imm import Imm
+from waldnet.common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Kinematic, Motion
+from waldnet.common.quantities import Duration, Finite, NotNegative
 
 Model: TypeAlias = Literal["cv", "ca", "ct"]
 Dimensions: TypeAlias = Literal[2, 3]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
-from common.errors import DecodeError
+from waldnet.common.errors import DecodeError
 
 #: What a notice is about.
 NoticeKind: TypeAlias = Literal["another scenario", "refused", "silent", "clock", "router"]

@@ -16,8 +16,8 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from cyclopts import App, Parameter, Token, validators
 
-from common.config import Network, Scenario, load_network
-from common.errors import WaldnetError
+from waldnet.common.config import Network, Scenario, load_network
+from waldnet.common.errors import WaldnetError
 
 
 def speed_factor(_: object, tokens: Sequence[Token]) -> float:
@@ -49,7 +49,7 @@ Seconds: TypeAlias = Annotated[float, Parameter(validator=_seconds)]
 #: Of a simulated world.
 Seed: TypeAlias = Annotated[int, Parameter(validator=validators.Number(gte=0))]
 
-#: Socket at which a process answers how it is; ask with python -m common.health.
+#: Socket at which a process answers how it is; ask with python -m waldnet.common.health.
 HealthSocket: TypeAlias = Annotated[Path | None, Parameter(name="--health")]
 
 #: Whether decisions on tracks that were never confirmed are told too.

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
-from common.limits import (
+from waldnet.common.limits import (
     FULL_CIRCLE,
     MAX_FALSE_PLOTS,
     MAX_NUMBER,

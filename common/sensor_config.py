@@ -11,19 +11,19 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from common.estimation.clutter_map import ClutterModel
-from common.estimation.detection import Constant, Detection, Notch, Swerling
-from common.estimation.field_of_view import AllAround, Box, Disc, Everywhere, FieldOfView
-from common.estimation.gaussian import Array
-from common.estimation.motion import Motion
-from common.estimation.polar import Bearing, Polar, PolarDoppler
-from common.estimation.pose import SensorPose
-from common.estimation.sector import Sector
-from common.estimation.sensing import Measurement, Position, Sensor
-from common.estimation.sigma_points import SigmaPoint
-from common.estimation.visibility import Visibility
-from common.limits import PlotLimits, plot_limits
-from common.quantities import (
+from waldnet.common.estimation.clutter_map import ClutterModel
+from waldnet.common.estimation.detection import Constant, Detection, Notch, Swerling
+from waldnet.common.estimation.field_of_view import AllAround, Box, Disc, Everywhere, FieldOfView
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.estimation.motion import Motion
+from waldnet.common.estimation.polar import Bearing, Polar, PolarDoppler
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sector import Sector
+from waldnet.common.estimation.sensing import Measurement, Position, Sensor
+from waldnet.common.estimation.sigma_points import SigmaPoint
+from waldnet.common.estimation.visibility import Visibility
+from waldnet.common.limits import PlotLimits, plot_limits
+from waldnet.common.quantities import (
     Angle,
     Decibels,
     Delay,

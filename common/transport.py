@@ -23,9 +23,9 @@ import zenoh
 from zenoh import ext
 from zenoh.handlers import FifoChannel
 
-from common.allowance import Allowance
-from common.config import Network
-from common.errors import TransportError
+from waldnet.common.allowance import Allowance
+from waldnet.common.config import Network
+from waldnet.common.errors import TransportError
 
 # Both are called on a transport thread and must only enqueue.
 Deliver = Callable[[str, bytes], None]  # key, payload

@@ -1,9 +1,9 @@
-"""``python -m fusion_center SCENARIO``."""
+"""``python -m waldnet.fusion_center SCENARIO``."""
 
 from cyclopts import App
 
-from common.process import main
-from fusion_center.app import center
+from waldnet.common.process import main
+from waldnet.fusion_center.app import center
 
 app = App(name="fusion_center", help="The fusion center.")
 app.default(center)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import time
 
-from common.config import load_scenario
-from common.health import answering
-from common.inbox import Inbox
-from common.logs import LogFormat, configure
-from common.process import HealthSocket, Hidden, NetworkOptions, Speed, Verbose, stopped_by_signals
-from common.transport import open_zenoh
-from fusion_center.center import Center
-from fusion_center.shell import CenterShell
-from scenarios.catalogue import find
+from waldnet.common.config import load_scenario
+from waldnet.common.health import answering
+from waldnet.common.inbox import Inbox
+from waldnet.common.logs import LogFormat, configure
+from waldnet.common.process import HealthSocket, Hidden, NetworkOptions, Speed, Verbose, stopped_by_signals
+from waldnet.common.transport import open_zenoh
+from waldnet.fusion_center.center import Center
+from waldnet.fusion_center.shell import CenterShell
+from waldnet.scenarios.catalogue import find
 
 
 def center(
@@ -36,7 +36,7 @@ def center(
         options: the network.
         speed: seconds of measurement time per second, for sources without a clock; max: as fast as all go together.
         wait: seconds to wait for the others once a sensor has joined; then the clock starts with those that are there.
-        health: local socket at which this process answers how it is (see: python -m common.health).
+        health: local socket at which this process answers how it is (see: python -m waldnet.common.health).
         log: how to log to standard error; auto: colour on a terminal, JSON elsewhere.
         verbose: log decisions on tracks that were never confirmed too.
         with_parent: end when standard input closes.

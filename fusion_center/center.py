@@ -13,13 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.config import Scenario
-from common.estimation.batch import take
-from common.estimation.gaussian import Gaussian
-from common.estimation.pose import SensorPose
-from common.estimation.sprt import DELETED
-from common.fusion_config import FusionConfig
-from common.messages import (
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.batch import take
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sprt import DELETED
+from waldnet.common.fusion_config import FusionConfig
+from waldnet.common.messages import (
     NEVER,
     Advice,
     Begin,
@@ -34,14 +34,14 @@ from common.messages import (
     Stop,
     Tracks,
 )
-from common.quantities import NS_PER_S
-from fusion_center.factors import Fuser
-from fusion_center.initiation import Initiation, Unclaimed
-from fusion_center.life import Life
-from fusion_center.picture import Picture, corrections, fused, shown
-from fusion_center.refusal import Refusal
-from fusion_center.selected import SelectedFuser
-from fusion_center.state import (
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.factors import Fuser
+from waldnet.fusion_center.initiation import Initiation, Unclaimed
+from waldnet.fusion_center.life import Life
+from waldnet.fusion_center.picture import Picture, corrections, fused, shown
+from waldnet.fusion_center.refusal import Refusal
+from waldnet.fusion_center.selected import SelectedFuser
+from waldnet.fusion_center.state import (
     AnyExpected,
     AnyFuser,
     AnyHeard,

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import Scenario, SensorConfig
-from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import (
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation.batch import concatenate, put, take
+from waldnet.common.estimation.gaussian import (
     Array,
     BoolArray,
     Gaussian,
@@ -22,19 +22,19 @@ from common.estimation.gaussian import (
     settled_whitener,
     whitener,
 )
-from common.estimation.imm import Imm, Modes, predict_modes
-from common.estimation.mixture_product import multiply_mixtures
-from common.estimation.motion import Motion
-from common.estimation.pose import SensorPose
-from common.estimation.ratio import log_lambda
-from common.estimation.representation import Share, globalise, shrink
-from common.estimation.sensing import Sensor
-from common.estimation.sprt import DELETED, TENTATIVE, Existence, survive
-from common.limits import MAX_ESTIMATE
-from common.messages import IntArray, Picked, Rebase, Report
-from common.quantities import NS_PER_S
-from fusion_center.picture import Backup, Picture, common
-from fusion_center.refusal import Refusal
+from waldnet.common.estimation.imm import Imm, Modes, predict_modes
+from waldnet.common.estimation.mixture_product import multiply_mixtures
+from waldnet.common.estimation.motion import Motion
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.ratio import log_lambda
+from waldnet.common.estimation.representation import Share, globalise, shrink
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.estimation.sprt import DELETED, TENTATIVE, Existence, survive
+from waldnet.common.limits import MAX_ESTIMATE
+from waldnet.common.messages import IntArray, Picked, Rebase, Report
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.picture import Backup, Picture, common
+from waldnet.fusion_center.refusal import Refusal
 
 #: A scan says less than a missed detection by so much only if its node follows something else.
 _DOUBTFUL = 1.0

@@ -8,22 +8,22 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from common.config import Scenario
-from common.estimation.association import gate_threshold
-from common.estimation.gating import inside_boxes
-from common.estimation.gaussian import Array, BoolArray, Gaussian, quadratic
-from common.estimation.initiation import apart, from_plots, with_second
-from common.estimation.motion import Motion
-from common.estimation.pose import SensorPose
-from common.estimation.sensing import Measurement, Sensor
-from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds
-from common.initiation_config import InitiationConfig
-from common.limits import MAX_VALUE, PlotLimits, is_possible
-from common.messages import Decision, IntArray, Picked, Report
-from common.quantities import NS_PER_S
-from fusion_center.life import decision_of
-from fusion_center.picture import Picture, common
-from fusion_center.refusal import Refusal
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.association import gate_threshold
+from waldnet.common.estimation.gating import inside_boxes
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, quadratic
+from waldnet.common.estimation.initiation import apart, from_plots, with_second
+from waldnet.common.estimation.motion import Motion
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sensing import Measurement, Sensor
+from waldnet.common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds
+from waldnet.common.initiation_config import InitiationConfig
+from waldnet.common.limits import MAX_VALUE, PlotLimits, is_possible
+from waldnet.common.messages import Decision, IntArray, Picked, Report
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.life import decision_of
+from waldnet.fusion_center.picture import Picture, common
+from waldnet.fusion_center.refusal import Refusal
 
 
 class Unclaimed(NamedTuple):

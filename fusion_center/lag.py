@@ -8,12 +8,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from common.config import Scenario
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.motion import Motion, predict
-from common.estimation.retrodiction import backward
-from common.messages import Tracks
-from common.quantities import NS_PER_S
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.motion import Motion, predict
+from waldnet.common.estimation.retrodiction import backward
+from waldnet.common.messages import Tracks
+from waldnet.common.quantities import NS_PER_S
 
 #: Pictures as far back as they are needed, oldest first.
 Past: TypeAlias = tuple[Tracks, ...]

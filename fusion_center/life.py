@@ -8,16 +8,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import Scenario, SensorConfig
-from common.estimation.gaussian import Array, BoolArray, Gaussian
-from common.estimation.motion import Motion
-from common.estimation.pose import SensorPose
-from common.estimation.sensing import Sensor
-from common.estimation.sprt import CONFIRMED, DELETED, Existence, Thresholds, decide, decide_with_life
-from common.life_config import LifeConfig
-from common.messages import Decision, DecisionKind
-from common.quantities import NS_PER_S
-from fusion_center.picture import Picture
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian
+from waldnet.common.estimation.motion import Motion
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.estimation.sprt import CONFIRMED, DELETED, Existence, Thresholds, decide, decide_with_life
+from waldnet.common.life_config import LifeConfig
+from waldnet.common.messages import Decision, DecisionKind
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.picture import Picture
 
 #: By chance alone a sensor misses a target as often in a row as it may with this probability, or so often at least.
 _CHANCE, _FEW_SCANS = 1e-3, 3

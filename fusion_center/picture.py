@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.batch import take
-from common.estimation.gaussian import Array, BoolArray
-from common.estimation.sprt import COASTING, DELETED, StatusArray
-from common.messages import Decision, IntArray, Tracks
+from waldnet.common.estimation.batch import take
+from waldnet.common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.sprt import COASTING, DELETED, StatusArray
+from waldnet.common.messages import Decision, IntArray, Tracks
 
 
 class Picture(NamedTuple):

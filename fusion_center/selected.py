@@ -9,20 +9,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
-from common.config import Scenario, SensorConfig
-from common.estimation.association import Plots
-from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, moments
-from common.estimation.mixture import Mixture
-from common.estimation.pose import SensorPose
-from common.estimation.sensing import Sensor
-from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Existence, survive
-from common.limits import is_possible
-from common.local_filter import SUREST, LocalFilter
-from common.messages import IntArray, Picked, Rebase, Report
-from common.quantities import NS_PER_S
-from fusion_center.picture import Backup, Picture, common
-from fusion_center.refusal import Refusal
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation.association import Plots
+from waldnet.common.estimation.batch import concatenate, put, take
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, moments
+from waldnet.common.estimation.mixture import Mixture
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Existence, survive
+from waldnet.common.limits import is_possible
+from waldnet.common.local_filter import SUREST, LocalFilter
+from waldnet.common.messages import IntArray, Picked, Rebase, Report
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.picture import Backup, Picture, common
+from waldnet.fusion_center.refusal import Refusal
 
 
 class HeardPlots(NamedTuple):

@@ -6,23 +6,23 @@ import time
 
 import structlog
 
-from common import notice
-from common.clock import now_ns, set_by_ns
-from common.codec import decode, encode
-from common.config import Network, Scenario
-from common.decision_filter import DecisionFilter
-from common.errors import DecodeError
-from common.health import Health, age_s
-from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
-from common.logs import Complaints
-from common.messages import NEVER, Clock, Decision, Join, Keys, Message, Picked, Report, Tracks, sensor_of
-from common.notice import Notice
-from common.transport import PEER_OF_ROUTER, Bus, Publisher
-from fusion_center.center import Center
-from fusion_center.punctuality import Punctuality
-from fusion_center.refusal import by_sensor
-from fusion_center.silence import PATIENCE_NS, Silence
-from fusion_center.state import Event, Presence, State, Tick
+from waldnet.common import notice
+from waldnet.common.clock import now_ns, set_by_ns
+from waldnet.common.codec import decode, encode
+from waldnet.common.config import Network, Scenario
+from waldnet.common.decision_filter import DecisionFilter
+from waldnet.common.errors import DecodeError
+from waldnet.common.health import Health, age_s
+from waldnet.common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
+from waldnet.common.logs import Complaints
+from waldnet.common.messages import NEVER, Clock, Decision, Join, Keys, Message, Picked, Report, Tracks, sensor_of
+from waldnet.common.notice import Notice
+from waldnet.common.transport import PEER_OF_ROUTER, Bus, Publisher
+from waldnet.fusion_center.center import Center
+from waldnet.fusion_center.punctuality import Punctuality
+from waldnet.fusion_center.refusal import by_sensor
+from waldnet.fusion_center.silence import PATIENCE_NS, Silence
+from waldnet.fusion_center.state import Event, Presence, State, Tick
 
 #: How long a finished center stays for nodes that have not heard of the end yet.
 _LINGER_NS = 2_000_000_000

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
-from common.estimation.gaussian import Gaussian
-from common.estimation.pose import SensorPose
-from common.messages import NEVER, Clock, Decision, IntArray, Join, Picked, Rebase, Report
-from fusion_center.factors import Expected, Heard
-from fusion_center.initiation import Pairs
-from fusion_center.picture import Backup, Picture
-from fusion_center.refusal import Refusal, Refused, add
-from fusion_center.selected import ExpectedTracks, HeardPlots
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.messages import NEVER, Clock, Decision, IntArray, Join, Picked, Rebase, Report
+from waldnet.fusion_center.factors import Expected, Heard
+from waldnet.fusion_center.initiation import Pairs
+from waldnet.fusion_center.picture import Backup, Picture
+from waldnet.fusion_center.refusal import Refusal, Refused, add
+from waldnet.fusion_center.selected import ExpectedTracks, HeardPlots
 
 
 class Presence(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from common.errors import ConfigError
+from waldnet.common.errors import ConfigError
 
 FOLDER = Path(__file__).parent
 

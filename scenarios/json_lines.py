@@ -13,8 +13,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from common.errors import WaldnetError
-from common.limits import MAX_ID, MAX_SECONDS, MAX_VALUE
+from waldnet.common.errors import WaldnetError
+from waldnet.common.limits import MAX_ID, MAX_SECONDS, MAX_VALUE
 
 T = TypeVar("T")
 

@@ -19,13 +19,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from common.config import Scenario, SensorConfig
-from common.estimation.association import innovations
-from common.estimation.gaussian import Array, BoolArray, Gaussian, times_transposed
-from common.estimation.sensing import Sensor
-from common.messages import IntArray, Scan
-from scenarios.persistence import Watch, correlation, fitted, watches
-from scenarios.trajectories import Trajectory
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation.association import innovations
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, times_transposed
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.messages import IntArray, Scan
+from waldnet.scenarios.persistence import Watch, correlation, fitted, watches
+from waldnet.scenarios.trajectories import Trajectory
 
 #: Radius of the gate, in units of the scenario's sigma; it is doubled up to so many times where errors reach its edge.
 GATE, _DOUBLED = 5.0, 2

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import expit
 
-from common.estimation.gaussian import Array, BoolArray
-from common.estimation.visibility import Visibility
+from waldnet.common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.visibility import Visibility
 
 #: Errors so long apart are compared [s].
 LAG_S = 2.0

@@ -17,14 +17,14 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from common.config import Scenario, SensorConfig
-from common.errors import PlotsError, PlotsWarning
-from common.estimation.gaussian import Array
-from common.estimation.pose import SensorPose
-from common.limits import FULL_CIRCLE, MAX_PLOTS, MAX_VALUE
-from common.messages import Scan
-from common.quantities import NS_PER_S
-from scenarios.json_lines import numbers, read_lines, seconds
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.errors import PlotsError, PlotsWarning
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.limits import FULL_CIRCLE, MAX_PLOTS, MAX_VALUE
+from waldnet.common.messages import Scan
+from waldnet.common.quantities import NS_PER_S
+from waldnet.scenarios.json_lines import numbers, read_lines, seconds
 
 #: What a line may say of the sensor.
 _POSE = ("position", "velocity", "heading")

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
-from common.config import Scenario, SensorConfig
-from common.estimation.gaussian import Array
-from common.messages import Scan
-from common.quantities import NS_PER_S
-from scenarios.scenario_check import Finding
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import Scan
+from waldnet.common.quantities import NS_PER_S
+from waldnet.scenarios.scenario_check import Finding
 
 #: Way and velocity are compared over so long, so that noise of positions does not count [s].
 _SPAN_S = 5.0

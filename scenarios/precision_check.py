@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from common.config import Scenario, SensorConfig
-from common.messages import Scan
-from common.sensor_config import BoxConfig, DiscConfig, EverywhereConfig, SectorConfig
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.messages import Scan
+from waldnet.common.sensor_config import BoxConfig, DiscConfig, EverywhereConfig, SectorConfig
 
 #: A step between two numbers of single precision is at most this part of a standard deviation: then log LR stays within
 #: 0.1 of that of double precision for hundreds of scans.

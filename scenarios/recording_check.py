@@ -12,14 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from common.config import Scenario, SensorConfig
-from common.estimation.association import innovations
-from common.estimation.gaussian import Array, BoolArray, Gaussian, log_pdf, times_transposed
-from common.estimation.initiation import from_plots
-from common.estimation.sector import Sector
-from common.estimation.sensing import Sensor
-from common.messages import Scan
-from scenarios.scenario_check import Finding, hypotheses_at
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation.association import innovations
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, log_pdf, times_transposed
+from waldnet.common.estimation.initiation import from_plots
+from waldnet.common.estimation.sector import Sector
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.messages import Scan
+from waldnet.scenarios.scenario_check import Finding, hypotheses_at
 
 _YEAR_S = 365.25 * 86_400.0
 #: A plot whose place lies inside with less than this probability, its noise considered, is outside.

@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import HypothesisConfig, Scenario, SensorConfig
-from common.estimation.gaussian import Array, BoolArray, Gaussian, quadratic
-from common.estimation.motion import Motion, predict
-from common.messages import Scan
-from scenarios.precision_check import precision_faults
+from waldnet.common.config import HypothesisConfig, Scenario, SensorConfig
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, quadratic
+from waldnet.common.estimation.motion import Motion, predict
+from waldnet.common.messages import Scan
+from waldnet.scenarios.precision_check import precision_faults
 
 #: A standard deviation of an angle above this is hardly one in radians [rad].
 WIDEST_SIGMA = 0.5

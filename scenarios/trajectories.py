@@ -11,12 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import Scenario
-from common.errors import TruthError
-from common.estimation.gaussian import Array
-from common.messages import IntArray
-from common.quantities import NS_PER_S
-from scenarios.truth import read_truth
+from waldnet.common.config import Scenario
+from waldnet.common.errors import TruthError
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import IntArray
+from waldnet.common.quantities import NS_PER_S
+from waldnet.scenarios.truth import read_truth
 
 
 class Trajectory(NamedTuple):

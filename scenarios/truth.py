@@ -14,12 +14,12 @@ from typing import Any, NamedTuple, TextIO
 
 import numpy as np
 
-from common.config import Scenario
-from common.errors import TruthError
-from common.estimation.gaussian import Array
-from common.messages import IntArray
-from common.quantities import NS_PER_S
-from scenarios.json_lines import identity, numbers, read_lines, seconds
+from waldnet.common.config import Scenario
+from waldnet.common.errors import TruthError
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import IntArray
+from waldnet.common.quantities import NS_PER_S
+from waldnet.scenarios.json_lines import identity, numbers, read_lines, seconds
 
 
 class Whereabouts(NamedTuple):

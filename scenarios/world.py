@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.config import ClutterSourceConfig, Scenario, SensorConfig, TargetConfig
-from common.errors import ConfigError
-from common.estimation.gaussian import Array, BoolArray, draw_noise
-from common.estimation.imm import draw_path
-from common.estimation.sensing import Sensor
-from common.messages import IntArray, Scan
-from common.quantities import NS_PER_S
-from scenarios.trajectories import read_trajectories
+from waldnet.common.config import ClutterSourceConfig, Scenario, SensorConfig, TargetConfig
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.gaussian import Array, BoolArray, draw_noise
+from waldnet.common.estimation.imm import draw_path
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.messages import IntArray, Scan
+from waldnet.common.quantities import NS_PER_S
+from waldnet.scenarios.trajectories import read_trajectories
 
 
 class Truth(NamedTuple):

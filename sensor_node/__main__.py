@@ -1,9 +1,9 @@
-"""``python -m sensor_node SCENARIO SENSOR``."""
+"""``python -m waldnet.sensor_node SCENARIO SENSOR``."""
 
 from cyclopts import App
 
-from common.process import main
-from sensor_node.app import node
+from waldnet.common.process import main
+from waldnet.sensor_node.app import node
 
 app = App(name="sensor_node", help="One sensor node.")
 app.default(node)

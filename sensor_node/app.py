@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from common.config import load_scenario
-from common.health import answering
-from common.inbox import Inbox
-from common.logs import LogFormat, configure
-from common.process import HealthSocket, Hidden, NetworkOptions, Seed, stopped_by_signals
-from common.transport import open_zenoh
-from scenarios.catalogue import find
-from sensor_node.shell import NodeShell
-from sensor_node.sources import source
-from sensor_node.tracker import LocalTracker
+from waldnet.common.config import load_scenario
+from waldnet.common.health import answering
+from waldnet.common.inbox import Inbox
+from waldnet.common.logs import LogFormat, configure
+from waldnet.common.process import HealthSocket, Hidden, NetworkOptions, Seed, stopped_by_signals
+from waldnet.common.transport import open_zenoh
+from waldnet.scenarios.catalogue import find
+from waldnet.sensor_node.shell import NodeShell
+from waldnet.sensor_node.sources import source
+from waldnet.sensor_node.tracker import LocalTracker
 
 
 def node(
@@ -37,7 +37,7 @@ def node(
         plots: recorded plots (JSON Lines) instead of the scenario's.
         seed: of the simulated world, instead of the scenario's.
         patience: seconds to wait for the first answer of a center before giving up.
-        health: local socket at which this process answers how it is (see: python -m common.health).
+        health: local socket at which this process answers how it is (see: python -m waldnet.common.health).
         log: how to log to standard error; auto: colour on a terminal, JSON elsewhere.
         with_parent: end when standard input closes.
     """

@@ -9,18 +9,18 @@ from collections.abc import Sequence
 
 import structlog
 
-from common import notice
-from common.clock import now_ns, set_by_ns
-from common.codec import decode, encode
-from common.config import Network
-from common.errors import ConfigError, DecodeError, TransportError, VersionError
-from common.health import Health, age_s
-from common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
-from common.logs import Complaints
-from common.messages import NEVER, Advice, Begin, Clock, Keys, Message, Rebase, Scan, Start, Stop
-from common.notice import Notice
-from common.transport import PEER_OF_ROUTER, Bus, Publisher
-from sensor_node.tracker import LocalTracker
+from waldnet.common import notice
+from waldnet.common.clock import now_ns, set_by_ns
+from waldnet.common.codec import decode, encode
+from waldnet.common.config import Network
+from waldnet.common.errors import ConfigError, DecodeError, TransportError, VersionError
+from waldnet.common.health import Health, age_s
+from waldnet.common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
+from waldnet.common.logs import Complaints
+from waldnet.common.messages import NEVER, Advice, Begin, Clock, Keys, Message, Rebase, Scan, Start, Stop
+from waldnet.common.notice import Notice
+from waldnet.common.transport import PEER_OF_ROUTER, Bus, Publisher
+from waldnet.sensor_node.tracker import LocalTracker
 
 #: Between two requests to join while no center answers.
 _JOIN_EVERY_NS = 1_000_000_000

@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit, ndtr
 
-from common.config import Scenario, SensorConfig
-from common.estimation import clutter_map
-from common.estimation.association import Expected, Plots
-from common.estimation.clutter_map import ClutterMap, ClutterModel
-from common.estimation.gaussian import Array, BoolArray
-from common.estimation.mixture import Mixture
-from common.estimation.pose import SensorPose
-from common.estimation.sensing import Sensor
-from common.local_filter import DOUBT, Left, LocalFilter
-from sensor_node.state import Look, Tracks
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation import clutter_map
+from waldnet.common.estimation.association import Expected, Plots
+from waldnet.common.estimation.clutter_map import ClutterMap, ClutterModel
+from waldnet.common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.mixture import Mixture
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.local_filter import DOUBT, Left, LocalFilter
+from waldnet.sensor_node.state import Look, Tracks
 
 
 class Seen(NamedTuple):

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from common.config import Scenario
-from common.errors import ConfigError
-from common.messages import NEVER, Scan
-from common.quantities import NS_PER_S
-from scenarios.plots import in_order, read_plots
-from scenarios.world import scan_times_ns, simulate, simulate_all
-from sensor_node.state import Schedule
+from waldnet.common.config import Scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.messages import NEVER, Scan
+from waldnet.common.quantities import NS_PER_S
+from waldnet.scenarios.plots import in_order, read_plots
+from waldnet.scenarios.world import scan_times_ns, simulate, simulate_all
+from waldnet.sensor_node.state import Schedule
 
 
 class Source(NamedTuple):

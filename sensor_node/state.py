@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import Expected, Plots
-from common.estimation.batch import concatenate, put, take
-from common.estimation.clutter_map import ClutterMap
-from common.estimation.gaussian import Array, BoolArray
-from common.estimation.mixture import Mixture
-from common.estimation.pose import SensorPose
-from common.messages import Advice, Begin, IntArray, Rebase
+from waldnet.common.estimation.association import Expected, Plots
+from waldnet.common.estimation.batch import concatenate, put, take
+from waldnet.common.estimation.clutter_map import ClutterMap
+from waldnet.common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.mixture import Mixture
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.messages import Advice, Begin, IntArray, Rebase
 
 
 class Tracks(NamedTuple):

@@ -12,21 +12,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from common.codec import Rounding
-from common.config import Scenario, SensorConfig
-from common.estimation import clutter_map
-from common.estimation.association import Expected, Plots
-from common.estimation.batch import concatenate, put, take
-from common.estimation.gaussian import Array, Gaussian, log_sum_exp
-from common.estimation.mixture import Mixture
-from common.estimation.pose import SensorPose
-from common.estimation.representation import globalise, shrink
-from common.estimation.selection import Selection, select
-from common.local_filter import SUREST, LocalFilter
-from common.messages import NEVER, Advice, Begin, IntArray, Join, Picked, Rebase, Report, Scan, Start, Stop
-from common.quantities import NS_PER_S
-from sensor_node.sight import Seen, Sight
-from sensor_node.state import Beliefs, Look, Ready, Schedule, State, Tracks, alike, left, put_tracks, with_before
+from waldnet.common.codec import Rounding
+from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation import clutter_map
+from waldnet.common.estimation.association import Expected, Plots
+from waldnet.common.estimation.batch import concatenate, put, take
+from waldnet.common.estimation.gaussian import Array, Gaussian, log_sum_exp
+from waldnet.common.estimation.mixture import Mixture
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.representation import globalise, shrink
+from waldnet.common.estimation.selection import Selection, select
+from waldnet.common.local_filter import SUREST, LocalFilter
+from waldnet.common.messages import NEVER, Advice, Begin, IntArray, Join, Picked, Rebase, Report, Scan, Start, Stop
+from waldnet.common.quantities import NS_PER_S
+from waldnet.sensor_node.sight import Seen, Sight
+from waldnet.sensor_node.state import (
+    Beliefs,
+    Look,
+    Ready,
+    Schedule,
+    State,
+    Tracks,
+    alike,
+    left,
+    put_tracks,
+    with_before,
+)
 
 
 @dataclass(frozen=True)

@@ -8,21 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from common.config import Scenario
-from common.messages import NEVER, Begin, Clock, Decision, Join, Message, Report, Scan, Start, Stop, Tracks
-from common.quantities import NS_PER_S
-from fusion_center.center import Center
-from fusion_center.state import Event, Tick
-from fusion_center.state import State as CenterState
-from sensor_node.sources import schedule_of
-from sensor_node.state import Schedule
-from sensor_node.state import State as NodeState
-from sensor_node.tracker import LocalTracker
-from studies.inputs import Source
-from studies.network import run_in_memory
-from studies.record import Record
-from studies.replay import Replay
-from studies.run_folder import RunFolder
+from waldnet.common.config import Scenario
+from waldnet.common.messages import NEVER, Begin, Clock, Decision, Join, Message, Report, Scan, Start, Stop, Tracks
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.center import Center
+from waldnet.fusion_center.state import Event, Tick
+from waldnet.fusion_center.state import State as CenterState
+from waldnet.offline.network import run_in_memory
+from waldnet.offline.replay import Replay
+from waldnet.recording.inputs import Source
+from waldnet.recording.record import Record
+from waldnet.recording.run_folder import RunFolder
+from waldnet.sensor_node.sources import schedule_of
+from waldnet.sensor_node.state import Schedule
+from waldnet.sensor_node.state import State as NodeState
+from waldnet.sensor_node.tracker import LocalTracker
 
 BOX = {"shape": "box", "center": [0.0, 0.0], "size": [20_000.0, 20_000.0]}
 

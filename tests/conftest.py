@@ -10,7 +10,7 @@ import pytest
 from hypothesis import settings
 from process_helpers import Processes
 
-from benchmarks.namespaces import Namespaces
+from waldnet.benchmarks.namespaces import Namespaces
 
 # The same examples every time; WALDNET_EXPLORE=1 looks for new ones.
 settings.register_profile("fixed", derandomize=True, deadline=None, database=None)

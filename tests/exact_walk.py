@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import norm
 
-from common.estimation.gaussian import Array
+from waldnet.common.estimation.gaussian import Array
 
 
 class Exit(NamedTuple):

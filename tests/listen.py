@@ -9,9 +9,9 @@ import sys
 import threading
 import time
 
-from common.config import Network
-from common.messages import Keys
-from common.transport import open_zenoh
+from waldnet.common.config import Network
+from waldnet.common.messages import Keys
+from waldnet.common.transport import open_zenoh
 
 _lock = threading.Lock()
 

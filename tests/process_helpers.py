@@ -19,14 +19,14 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from common.codec import decode
-from common.config import Network, Scenario, load_scenario
-from common.inbox import Heard, Inbox, Present
-from common.messages import Keys, Tracks
-from common.transport import Bus, open_zenoh
-from scenarios.catalogue import find
-from studies.lines import TrackLines
-from studies.record import Record
+from waldnet.common.codec import decode
+from waldnet.common.config import Network, Scenario, load_scenario
+from waldnet.common.inbox import Heard, Inbox, Present
+from waldnet.common.messages import Keys, Tracks
+from waldnet.common.transport import Bus, open_zenoh
+from waldnet.recording.lines import TrackLines
+from waldnet.recording.record import Record
+from waldnet.scenarios.catalogue import find
 
 #: Nothing takes so long, even on a busy machine; whoever waits longer waits in vain. Less than a test may take.
 PATIENCE_S = 120.0

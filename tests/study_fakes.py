@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from common.config import Scenario
-from common.messages import IntArray
-from studies.course import Course, Worlds
+from waldnet.common.config import Scenario
+from waldnet.common.messages import IntArray
+from waldnet.studies.course import Course, Worlds
 
 #: Name: share of the evidence that a mode gets, error [m], bytes up and down.
 MODES: dict[str, tuple[float, float, float, float]] = {
@@ -57,6 +57,6 @@ def play(scenario: Scenario, mode: str, worlds: Worlds) -> Course:
 
 def take_over(monkeypatch: Any) -> None:
     """Let studies of this process play these modes."""
-    monkeypatch.setattr("studies.modes.MODES", MODES)
-    monkeypatch.setattr("studies.modes.play", play)
-    monkeypatch.setattr("studies.worlds.draw", draw)
+    monkeypatch.setattr("waldnet.studies.modes.MODES", MODES)
+    monkeypatch.setattr("waldnet.studies.modes.play", play)
+    monkeypatch.setattr("waldnet.studies.worlds.draw", draw)

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from common.allowance import Allowance
+from waldnet.common.allowance import Allowance
 
 Puts = st.lists(st.tuples(st.floats(0.0, 5.0), st.integers(0, 30_000), st.booleans()), max_size=60)
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 from builders import live_as_replayed
 
-from common.config import Scenario, load_scenario
-from common.messages import Tracks
-from scenarios import catalogue
-from scenarios.autoferry import measure
-from scenarios.autoferry.convert import SCENARIOS, main
-from scenarios.truth import read_truth
-from sensor_node.sources import all_scans
-from studies.replay import Replay
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.messages import Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios import catalogue
+from waldnet.scenarios.autoferry import measure
+from waldnet.scenarios.autoferry.convert import SCENARIOS, main
+from waldnet.scenarios.truth import read_truth
+from waldnet.sensor_node.sources import all_scans
 
 FOLDER = catalogue.FOLDER / "autoferry"
 SHIP = [-16.0, -390.0]  # north, east

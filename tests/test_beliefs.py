@@ -9,14 +9,14 @@ import pytest
 from builders import Node, Stage, hypothesis_table, only, scenario, sensor_table
 from scipy.special import expit, logsumexp
 
-from common.config import Scenario
-from common.estimation.gaussian import Array
-from common.estimation.imm import Imm
-from common.estimation.pose import SensorPose
-from common.local_filter import SUREST
-from common.messages import Advice, Begin, Message, Rebase, Report, Scan, Start, Tracks
-from scenarios.world import simulate_all
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.estimation.imm import Imm
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.local_filter import SUREST
+from waldnet.common.messages import Advice, Begin, Message, Rebase, Report, Scan, Start, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate_all
 
 LOSES = {"visible_for": 40.0, "hidden_for": 20.0}
 FAR = {"shape": "box", "center": [0.0, 0.0], "size": [1e6, 1e6]}

@@ -14,17 +14,17 @@ import pytest
 from builders import scenario
 from process_helpers import Processes
 
-from benchmarks.bandwidth import draw, measure, table, worlds
-from benchmarks.crew import BenchError, Crew
-from benchmarks.latency import parts_of
-from benchmarks.namespaces import Namespaces
-from benchmarks.precision import compare
-from benchmarks.traffic import messages
-from benchmarks.worlds import World
-from common.messages import Report, Scan
-from sensor_node.sources import all_scans
-from studies.network import run_in_memory
-from studies.replay import Replay
+from waldnet.benchmarks.bandwidth import draw, measure, table, worlds
+from waldnet.benchmarks.crew import BenchError, Crew
+from waldnet.benchmarks.latency import parts_of
+from waldnet.benchmarks.namespaces import Namespaces
+from waldnet.benchmarks.precision import compare
+from waldnet.benchmarks.traffic import messages
+from waldnet.benchmarks.worlds import World
+from waldnet.common.messages import Report, Scan
+from waldnet.offline.network import run_in_memory
+from waldnet.offline.replay import Replay
+from waldnet.sensor_node.sources import all_scans
 
 SMALL = World(tracks=7, sensors=2, false_plots=3.0, interval_s=0.5, scans=4)
 
@@ -118,14 +118,14 @@ def test_a_machine_without_namespaces_is_told_what_it_lacks(monkeypatch: pytest.
 
 def test_a_process_of_a_benchmark_that_fails_says_why() -> None:
     with Crew() as crew, pytest.raises(BenchError, match=r"benchmarks\.raw relay: ended with exit code 1: .*Error"):
-        crew.start("benchmarks.raw", "relay").hear()
+        crew.start("waldnet.benchmarks.raw", "relay").hear()
 
 
 def test_figures_are_put_where_the_document_names_their_command(tmp_path: Path) -> None:
     document = tmp_path / "figures.md"
     places = [f"<!-- figures: echo {word} -->\nold\n<!-- end -->" for word in ("one", "two")]
     document.write_text("\n\n".join(places))
-    subprocess.run([sys.executable, "-m", "benchmarks.figures", document, "one"], check=True)
+    subprocess.run([sys.executable, "-m", "waldnet.benchmarks.figures", document, "one"], check=True)
     text = document.read_text()
     assert "<!-- figures: echo one -->\n\none\n\n<!-- end -->" in text
     assert places[1] in text

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks import load, scaling
-from benchmarks.crew import BenchError
-from benchmarks.scaling import Cell
-from scenarios.world import truth
+from waldnet.benchmarks import load, scaling
+from waldnet.benchmarks.crew import BenchError
+from waldnet.benchmarks.scaling import Cell
+from waldnet.scenarios.world import truth
 
 
 @pytest.mark.parametrize("area", ["grows", "same"])

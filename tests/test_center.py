@@ -9,12 +9,12 @@ from builders import Node, Stage, all_same, hypothesis_table, only, reports_of, 
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.config import Scenario
-from common.messages import NEVER, Advice, Clock, Decision, Join, Report, Scan, Start, Stop, Tracks
-from common.quantities import NS_PER_S
-from fusion_center.state import Presence
-from scenarios.world import simulate, simulate_all
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.messages import NEVER, Advice, Clock, Decision, Join, Report, Scan, Start, Stop, Tracks
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.state import Presence
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate, simulate_all
 
 UNDECIDED = {"enabled": False}
 #: Far enough over both thresholds to outweigh whatever the factors say.

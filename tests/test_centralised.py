@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from builders import hypothesis_table, scenario, sensor_table
 
-from common.config import Scenario, load_scenario
-from common.estimation.gaussian import Gaussian
-from common.messages import Decision, Scan, Tracks
-from common.process import main
-from launch.cli import app
-from scenarios.catalogue import find
-from scenarios.world import simulate_all
-from studies import baselines
-from studies.centralised import Centralised
-from studies.replay import Replay
-from studies.worlds import draw
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.messages import Decision, Scan, Tracks
+from waldnet.common.process import main
+from waldnet.launch.cli import app
+from waldnet.offline.centralised import Centralised
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.catalogue import find
+from waldnet.scenarios.world import simulate_all
+from waldnet.studies import baselines
+from waldnet.studies.worlds import draw
 
 FERRY = {"shape": "disc", "radius": 20_000.0}
 #: Of every kind, some of them at the same times.

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from builders import Node, Stage, live_as_replayed, scenario, sensor_table
 
-from common.config import Scenario, load_scenario
-from common.errors import ConfigError
-from common.estimation.clutter_map import ClutterMap, log_relative
-from common.estimation.gaussian import Array
-from common.messages import Report, Scan, Tracks
-from scenarios.world import simulate, simulate_all
-from studies.plan import Order, check
-from studies.replay import Replay
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.clutter_map import ClutterMap, log_relative
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import Report, Scan, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate, simulate_all
+from waldnet.studies.plan import Order, check
 
 MAP = {"cell": 100.0, "memory": 120.0, "shape": 3e-3, "start_below": 10.0}
 OWN = {"false_plots": 60.0, "sigma": [50.0, 50.0]}

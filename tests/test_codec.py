@@ -10,10 +10,10 @@ from builders import same
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.codec import LAYOUTS, ROUNDED, VERSION, Rounding, as_sent, decode, encode
-from common.errors import DecodeError, VersionError
-from common.estimation.gaussian import are_positive_definite
-from common.messages import (
+from waldnet.common.codec import LAYOUTS, ROUNDED, VERSION, Rounding, as_sent, decode, encode
+from waldnet.common.errors import DecodeError, VersionError
+from waldnet.common.estimation.gaussian import are_positive_definite
+from waldnet.common.messages import (
     NEVER,
     Advice,
     Begin,

@@ -16,10 +16,10 @@ from typing import NamedTuple
 import pytest
 from process_helpers import Observer, Processes, assert_agree, free_endpoint, observe, points, points_of, variant
 
-from common.config import Network
-from common.estimation.sprt import Status
-from common.messages import Tracks
-from common.transport import open_zenoh
+from waldnet.common.config import Network
+from waldnet.common.estimation.sprt import Status
+from waldnet.common.messages import Tracks
+from waldnet.common.transport import open_zenoh
 
 pytestmark = [pytest.mark.docker, pytest.mark.timeout(540)]
 

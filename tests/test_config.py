@@ -9,13 +9,13 @@ from builders import scenario, sensor_table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.config import Network, Scenario, load_network, load_scenario
-from common.errors import ConfigError
-from common.estimation.association import Choice, kalman, nearest, normalise
-from common.estimation.field_of_view import Box, Disc, Everywhere
-from common.estimation.mixture import Reduction
-from common.initiation_config import InitiationConfig
-from scenarios import catalogue
+from waldnet.common.config import Network, Scenario, load_network, load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.association import Choice, kalman, nearest, normalise
+from waldnet.common.estimation.field_of_view import Box, Disc, Everywhere
+from waldnet.common.estimation.mixture import Reduction
+from waldnet.common.initiation_config import InitiationConfig
+from waldnet.scenarios import catalogue
 
 GOOD = """\
 name = "coast"

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from process_helpers import Processes
 
-from common.health import fault
-from scenarios.truth import read_truth
+from waldnet.common.health import fault
+from waldnet.scenarios.truth import read_truth
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

@@ -11,13 +11,13 @@ import pytest
 from stonesoup.metricgenerator.ospametric import GOSPAMetric, OSPAMetric
 from stonesoup.types.state import State
 
-from common.estimation.gaussian import Array
-from scenarios.truth import Whereabouts
-from studies.evaluate.evaluation import Evaluation, Rules, judge
-from studies.evaluate.ospa import gospa_over_time, match, ospa2_over_time
-from studies.evaluate.paths import Paths, distances, judged_times, sampled, targets_at
-from studies.evaluate.runs import Run
-from studies.gospa import gospa
+from waldnet.common.estimation.gaussian import Array
+from waldnet.evaluation.evaluation import Evaluation, Rules, judge
+from waldnet.evaluation.ospa import gospa_over_time, match, ospa2_over_time
+from waldnet.evaluation.paths import Paths, distances, judged_times, sampled, targets_at
+from waldnet.evaluation.runs import Run
+from waldnet.scenarios.truth import Whereabouts
+from waldnet.studies.gospa import gospa
 
 C = 10.0
 

@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 from builders import only, scenario, write_report
 
-from common.config import load_scenario
-from common.errors import EvaluationError, TruthError
-from common.messages import Tracks
-from common.process import main
-from launch.cli import app
-from scenarios.catalogue import find
-from scenarios.truth import read_truth, write_truth
-from scenarios.world import simulate_all, truth
-from studies.evaluate.runs import names, read_run
-from studies.evaluate.yardstick import centralised
-from studies.inputs import Source, kept
-from studies.record import Record
-from studies.replay import Replay
-from studies.run_folder import RunFolder
+from waldnet.common.config import load_scenario
+from waldnet.common.errors import EvaluationError, TruthError
+from waldnet.common.messages import Tracks
+from waldnet.common.process import main
+from waldnet.evaluation.runs import names, read_run
+from waldnet.evaluation.yardstick import centralised
+from waldnet.launch.cli import app
+from waldnet.offline.replay import Replay
+from waldnet.recording.inputs import Source, kept
+from waldnet.recording.record import Record
+from waldnet.recording.run_folder import RunFolder
+from waldnet.scenarios.catalogue import find
+from waldnet.scenarios.truth import read_truth, write_truth
+from waldnet.scenarios.world import simulate_all, truth
 
 LINE: dict[str, Any] = {"time": 2.0, "track": 5, "status": "confirmed", "x": [1.0, 2.0, 3.0, 4.0], "P": []}
 POINT: dict[str, Any] = {"target": 1, "time": 2.0, "position": [1.0, 2.0]}

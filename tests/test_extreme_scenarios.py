@@ -14,11 +14,11 @@ from cyclopts import App
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.config import load_scenario
-from common.errors import ConfigError
-from common.estimation.gaussian import are_positive_definite, settled_whitener
-from common.process import main
-from launch.cli import app
+from waldnet.common.config import load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.gaussian import are_positive_definite, settled_whitener
+from waldnet.common.process import main
+from waldnet.launch.cli import app
 
 SCANS = 4
 

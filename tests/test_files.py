@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from common.files import LinesFile, replacing, write_atomically
+from waldnet.common.files import LinesFile, replacing, write_atomically
 
 
 def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:

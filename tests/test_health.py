@@ -15,10 +15,10 @@ from pathlib import Path
 import pytest
 from process_helpers import ANY_PORT, PATIENCE_S, Processes, start_center, variant
 
-from common import health
-from common.errors import TransportError
-from common.health import answering
-from common.inbox import Asked, Inbox, Stopped
+from waldnet.common import health
+from waldnet.common.errors import TransportError
+from waldnet.common.health import answering
+from waldnet.common.inbox import Asked, Inbox, Stopped
 
 
 @pytest.fixture

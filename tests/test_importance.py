@@ -9,8 +9,8 @@ import pytest
 from exact_walk import ever_above, renewal_constant
 from scipy.stats import binomtest
 
-from common.estimation.gaussian import Array
-from studies.importance import calibration, crossing_weights
+from waldnet.common.estimation.gaussian import Array
+from waldnet.studies.importance import calibration, crossing_weights
 
 B = np.array([2.0, 10.0, 1e2, 1e4, 1e6])
 

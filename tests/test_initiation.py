@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from builders import Node, Stage, live_as_replayed, only, scenario, sensor_table
 
-from common.config import Scenario
-from common.estimation.gaussian import Gaussian
-from common.estimation.pose import SensorPose
-from common.messages import NEVER, Begin, Decision, Join, Message, Report, Scan, Start, Stop, Tracks
-from fusion_center.initiation import Initiation, Unclaimed
-from fusion_center.picture import Picture
-from scenarios.world import simulate_all
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.messages import NEVER, Begin, Decision, Join, Message, Report, Scan, Start, Stop, Tracks
+from waldnet.fusion_center.initiation import Initiation, Unclaimed
+from waldnet.fusion_center.picture import Picture
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate_all
 
 NONE = np.empty(0, np.int64)
 

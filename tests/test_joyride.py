@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from builders import live_as_replayed
 
-from benchmarks.real_halves import changed
-from common.config import load_scenario
-from common.estimation.sprt import CONFIRMED
-from common.messages import Tracks
-from scenarios import catalogue
-from scenarios.joyride import measure
-from scenarios.truth import read_truth
-from sensor_node.sources import all_scans
-from studies.replay import Replay
+from waldnet.benchmarks.real_halves import changed
+from waldnet.common.config import load_scenario
+from waldnet.common.estimation.sprt import CONFIRMED
+from waldnet.common.messages import Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios import catalogue
+from waldnet.scenarios.joyride import measure
+from waldnet.scenarios.truth import read_truth
+from waldnet.sensor_node.sources import all_scans
 
 FOLDER = catalogue.FOLDER / "joyride"
 FILES = {"joyride.jsonl": "joyride.jsonl", "joyride-truth.jsonl": "joyride-truth.jsonl", "LICENSE": "LICENSE-CC0"}

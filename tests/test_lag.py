@@ -12,17 +12,17 @@ from builders import scenario, sensor_table
 from enumeration import Problem, least_squares
 from scipy.stats import chi2, t
 
-from common.config import Scenario
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.motion import ConstantVelocity, predict
-from common.messages import Tracks
-from common.process import main
-from common.quantities import NS_PER_S
-from fusion_center.lag import FixedLag, Past
-from launch.cli import app
-from studies.course import Worlds
-from studies.modes import play
-from studies.worlds import draw
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.motion import ConstantVelocity, predict
+from waldnet.common.messages import Tracks
+from waldnet.common.process import main
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.lag import FixedLag, Past
+from waldnet.launch.cli import app
+from waldnet.studies.course import Worlds
+from waldnet.studies.modes import play
+from waldnet.studies.worlds import draw
 
 MOTION = ConstantVelocity(2, 3.0)
 H, R = np.eye(2, 4), np.diag([16.0, 49.0])

@@ -15,21 +15,21 @@ from process_helpers import PATIENCE_S, variant
 from rich.console import Console
 from structlog.testing import capture_logs
 
-from common.codec import encode
-from common.config import load_scenario
-from common.errors import ConfigError, WaldnetError
-from common.estimation.sprt import Status
-from common.inbox import Inbox, Missed
-from common.memory import MemoryNetwork
-from common.messages import Decision, Keys, Scan, Start, Tracks
-from fusion_center.center import Center
-from fusion_center.shell import CenterShell
-from launch.run import Order, Run
-from launch.status import LiveStatus
-from sensor_node.shell import NodeShell
-from sensor_node.tracker import LocalTracker
-from studies.record import Record
-from studies.run_folder import RunFolder
+from waldnet.common.codec import encode
+from waldnet.common.config import load_scenario
+from waldnet.common.errors import ConfigError, WaldnetError
+from waldnet.common.estimation.sprt import Status
+from waldnet.common.inbox import Inbox, Missed
+from waldnet.common.memory import MemoryNetwork
+from waldnet.common.messages import Decision, Keys, Scan, Start, Tracks
+from waldnet.fusion_center.center import Center
+from waldnet.fusion_center.shell import CenterShell
+from waldnet.launch.run import Order, Run
+from waldnet.launch.status import LiveStatus
+from waldnet.recording.record import Record
+from waldnet.recording.run_folder import RunFolder
+from waldnet.sensor_node.shell import NodeShell
+from waldnet.sensor_node.tracker import LocalTracker
 
 
 def picture(time_s: float, tracks: dict[int, Status]) -> Tracks:

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from builders import Stage, live_as_replayed, scenario, sensor_table
 
-from common.config import Scenario
-from common.estimation.gaussian import Gaussian
-from common.estimation.pose import SensorPose
-from common.estimation.sprt import CONFIRMED, Existence, Status, decide_with_life, survive, thresholds
-from common.messages import Decision, Scan, Tracks
-from fusion_center.life import Life
-from fusion_center.picture import Picture
-from studies.centralised import Centralised
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sprt import CONFIRMED, Existence, Status, decide_with_life, survive, thresholds
+from waldnet.common.messages import Decision, Scan, Tracks
+from waldnet.fusion_center.life import Life
+from waldnet.fusion_center.picture import Picture
+from waldnet.offline.centralised import Centralised
+from waldnet.offline.replay import Replay
 
 LIMITS = thresholds(1e-4, 0.99, 0.999)
 

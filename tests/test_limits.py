@@ -13,16 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from common.config import load_scenario
-from common.errors import PlotsError
-from common.limits import MAX_ESTIMATE, MAX_VALUE
-from common.messages import Begin, Picked, Report, Scan
-from fusion_center.initiation import Initiation
-from launch.cli import app
-from launch.left_out import left_out
-from scenarios.plots import read_plots
-from scenarios.world import simulate_all
-from studies.replay import Replay
+from waldnet.common.config import load_scenario
+from waldnet.common.errors import PlotsError
+from waldnet.common.limits import MAX_ESTIMATE, MAX_VALUE
+from waldnet.common.messages import Begin, Picked, Report, Scan
+from waldnet.fusion_center.initiation import Initiation
+from waldnet.launch.cli import app
+from waldnet.launch.left_out import left_out
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.plots import read_plots
+from waldnet.scenarios.world import simulate_all
 
 Array = NDArray[np.float64]
 DISC = {"shape": "disc", "radius": 1000.0}

@@ -23,11 +23,11 @@ from process_helpers import (
     variant,
 )
 
-from benchmarks.namespaces import Counters, Link, Namespaces
-from common.codec import decode, encode
-from common.config import Scenario, load_scenario
-from common.messages import Clock, Keys, Message, Report, Scan, Tracks, sensor_of
-from studies.record import Record
+from waldnet.benchmarks.namespaces import Counters, Link, Namespaces
+from waldnet.common.codec import decode, encode
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.messages import Clock, Keys, Message, Report, Scan, Tracks, sensor_of
+from waldnet.recording.record import Record
 
 RATE_BIT_S = 64_000
 SLOW = Link(rate_bit_s=RATE_BIT_S, delay_s=0.2, jitter_s=0.02)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from builders import hypothesis_table, scenario, sensor_table
 
-from common.config import Scenario
-from common.estimation.association import Expected, Plots, normalise
-from common.estimation.gaussian import Array, Gaussian, moments
-from common.estimation.mixture import Mixture
-from common.estimation.notch import filtered, hypotheses
-from common.estimation.sensing import Sensor
-from common.local_filter import LocalFilter
-from common.messages import Scan, Tracks
-from scenarios.world import simulate_all
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.association import Expected, Plots, normalise
+from waldnet.common.estimation.gaussian import Array, Gaussian, moments
+from waldnet.common.estimation.mixture import Mixture
+from waldnet.common.estimation.notch import filtered, hypotheses
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.local_filter import LocalFilter
+from waldnet.common.messages import Scan, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate_all
 
 UNDECIDED = {"enabled": False}
 CV = {"model": "cv", "psd": 4.0}

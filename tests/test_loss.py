@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from common.config import load_scenario
-from scenarios.catalogue import find
-from studies.modes import play
-from studies.worlds import draw
+from waldnet.common.config import load_scenario
+from waldnet.scenarios.catalogue import find
+from waldnet.studies.modes import play
+from waldnet.studies.worlds import draw
 
 
 def test_tight_association_loses_far_fewer_tracks_in_heavy_clutter() -> None:

@@ -12,18 +12,18 @@ import pytest
 from builders import hypothesis_table, scenario, sensor_table
 from scipy.stats import binom, poisson
 
-from common.config import Scenario
-from common.errors import ConfigError, TruthError
-from common.messages import Scan, Tracks
-from launch.measuring import measure, measured, suggested
-from scenarios import catalogue
-from scenarios.measure import Figure, SensorFigures, assign, measure_sensor, true_paths
-from scenarios.trajectories import Trajectory
-from scenarios.truth import write_truth
-from scenarios.world import simulate_all
-from scenarios.world import truth as true_states
-from studies.centralised import Centralised
-from studies.false_tracks import false_tracks
+from waldnet.common.config import Scenario
+from waldnet.common.errors import ConfigError, TruthError
+from waldnet.common.messages import Scan, Tracks
+from waldnet.evaluation.false_tracks import false_tracks
+from waldnet.launch.measuring import measure, measured, suggested
+from waldnet.offline.centralised import Centralised
+from waldnet.scenarios import catalogue
+from waldnet.scenarios.measure import Figure, SensorFigures, assign, measure_sensor, true_paths
+from waldnet.scenarios.trajectories import Trajectory
+from waldnet.scenarios.truth import write_truth
+from waldnet.scenarios.world import simulate_all
+from waldnet.scenarios.world import truth as true_states
 
 FERRY = catalogue.FOLDER / "autoferry"
 VIEW = {"shape": "disc", "radius": 6000.0}

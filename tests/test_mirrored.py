@@ -24,11 +24,11 @@ from reference import (
 )
 from scipy.special import logsumexp
 
-from common.codec import as_sent
-from common.config import Scenario
-from common.messages import Report, Scan, Start, Tracks
-from scenarios.world import simulate_all
-from studies.replay import Replay
+from waldnet.common.codec import as_sent
+from waldnet.common.config import Scenario
+from waldnet.common.messages import Report, Scan, Start, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate_all
 
 AREA = 4e6
 PSD = 5.0

@@ -12,16 +12,16 @@ import pytest
 from builders import all_same, scenario, sensor_table, write_report
 from scipy import stats
 
-from common.config import Scenario, load_scenario
-from common.errors import PlotsError
-from common.estimation.gaussian import Array
-from common.messages import Decision, Scan, Tracks
-from scenarios import catalogue
-from scenarios.plots import read_plots, write_plots
-from scenarios.world import simulate, simulate_all, truth
-from studies.network import run_in_memory
-from studies.record import Record
-from studies.replay import Replay
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.errors import PlotsError
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import Decision, Scan, Tracks
+from waldnet.offline.network import run_in_memory
+from waldnet.offline.replay import Replay
+from waldnet.recording.record import Record
+from waldnet.scenarios import catalogue
+from waldnet.scenarios.plots import read_plots, write_plots
+from waldnet.scenarios.world import simulate, simulate_all, truth
 
 #: Probability that a statistical test fails though the code is right; seeds are fixed, so it fails always or never.
 ALPHA = 1e-3

@@ -10,15 +10,15 @@ import pytest
 from builders import hypothesis_table, scenario, sensor_table
 from reference import Density, Seer, corrected, predicted
 
-from common.codec import Rounding, encode
-from common.config import Scenario
-from common.messages import Advice, Decision, Message, Picked, Rebase, Report, Scan, Tracks
-from scenarios.world import simulate_all, truth
-from studies.baselines import with_fusion
-from studies.course import Course
-from studies.modes import MODES, play
-from studies.replay import Replay
-from studies.worlds import draw
+from waldnet.common.codec import Rounding, encode
+from waldnet.common.config import Scenario
+from waldnet.common.messages import Advice, Decision, Message, Picked, Rebase, Report, Scan, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate_all, truth
+from waldnet.studies.baselines import with_fusion
+from waldnet.studies.course import Course
+from waldnet.studies.modes import MODES, play
+from waldnet.studies.worlds import draw
 
 SEEDS = np.array([4, 1, 7])
 DISTRIBUTED = {name: mode for name, mode in MODES.items() if "fusion" not in name and hasattr(mode, "keywords")}

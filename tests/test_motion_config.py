@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.config import load_scenario
-from common.errors import ConfigError
-from common.estimation.imm import Imm
-from common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Motion
-from scenarios.world import truth
+from waldnet.common.config import load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.imm import Imm
+from waldnet.common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Motion
+from waldnet.scenarios.world import truth
 
 REST = """
 name = "motions"

@@ -10,11 +10,11 @@ from builders import scenario, sensor_table
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
 
-from common.config import Scenario
-from common.estimation.gaussian import Array
-from common.messages import Scan, Tracks
-from scenarios.world import simulate_all, truth
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import Scan, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate_all, truth
 
 AREA = 1e8
 SIGMA, INTERVALS = {"a": 40.0, "b": 25.0}, {"a": 2.0, "b": 3.5}

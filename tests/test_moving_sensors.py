@@ -18,17 +18,17 @@ import numpy as np
 import pytest
 from builders import all_same, live_as_replayed, same, scenario, sensor_table
 
-from common.config import Scenario
-from common.errors import PlotsError, PlotsWarning
-from common.estimation.gaussian import Array
-from common.messages import NEVER, Decision, Scan, Start, Tracks
-from scenarios.plots import read_plots, write_plots
-from scenarios.world import simulate_all
-from sensor_node.tracker import LocalTracker
-from studies import baselines
-from studies.centralised import Centralised
-from studies.replay import Replay
-from studies.worlds import draw
+from waldnet.common.config import Scenario
+from waldnet.common.errors import PlotsError, PlotsWarning
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import NEVER, Decision, Scan, Start, Tracks
+from waldnet.offline.centralised import Centralised
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.plots import read_plots, write_plots
+from waldnet.scenarios.world import simulate_all
+from waldnet.sensor_node.tracker import LocalTracker
+from waldnet.studies import baselines
+from waldnet.studies.worlds import draw
 
 #: Carried along with [m/s], turned by [rad].
 VELOCITY, HEADING = np.array([9.0, -22.0]), 2.0
@@ -323,7 +323,7 @@ def test_the_command_line_says_it_once_and_goes_on(tmp_path: Path) -> None:
         speed = 10.0
         """
     )
-    plots, start = written(tmp_path, rows), [sys.executable, "-c", "from launch.cli import main; main()"]
+    plots, start = written(tmp_path, rows), [sys.executable, "-c", "from waldnet.launch.cli import main; main()"]
     done = subprocess.run([*start, "replay", table, plots], capture_output=True, text=True, check=True)
     assert done.stderr == f"warning: {plots}{UNTOLD}\n"
     for strict, code in (([], 0), (["--strict"], 1)):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.namespaces import Link, Namespaces
+from waldnet.benchmarks.namespaces import Link, Namespaces
 
 pytestmark = pytest.mark.netns
 
@@ -104,7 +104,7 @@ def test_a_cut_link_carries_nothing_until_it_is_healed() -> None:
 def test_nothing_stays_behind_when_the_owner_is_killed() -> None:
     owner = """
 import os, subprocess, sys
-from benchmarks.namespaces import Namespaces
+from waldnet.benchmarks.namespaces import Namespaces
 net = Namespaces("a").__enter__()
 child = subprocess.Popen(net.command("a", ["sleep", "600"]))
 with open(net.command("a", [])[1].removeprefix("--net=")) as handle:

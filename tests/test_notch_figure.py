@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from common.estimation.gaussian import Array
-from studies.notch import _PRIOR, _SOUTH, _WEST, Look, exact, worked_in
+from waldnet.common.estimation.gaussian import Array
+from waldnet.studies.notch import _PRIOR, _SOUTH, _WEST, Look, exact, worked_in
 
 NOTHING, HERE = np.empty((0, 2)), np.zeros((1, 2))
 
@@ -48,5 +48,5 @@ def test_the_ellipses_are_those_of_the_exact_density(looks: list[Look]) -> None:
 
 def test_the_command_writes_the_figure(tmp_path: Path) -> None:
     path = tmp_path / "notch.png"
-    subprocess.run([sys.executable, "-m", "studies.notch", path], check=True)
+    subprocess.run([sys.executable, "-m", "waldnet.studies.notch", path], check=True)
     assert path.read_bytes().startswith(b"\x89PNG")

@@ -18,25 +18,25 @@ from process_helpers import ANY_PORT, PATIENCE_S, Processes, free_endpoint, log_
 from rich.console import Console
 from structlog.testing import capture_logs
 
-from common import clock, health, notice
-from common.clock import now_ns
-from common.codec import decode, encode
-from common.config import Network, Scenario, load_scenario
-from common.errors import ConfigError
-from common.health import Health
-from common.inbox import Heard, Inbox
-from common.memory import MemoryNetwork
-from common.messages import NEVER, Clock, Join, Keys, Report, Scan, Start
-from common.notice import Notice
-from common.quantities import NS_PER_S
-from common.transport import Bus, open_zenoh
-from fusion_center.center import Center
-from fusion_center.shell import CenterShell
-from launch.run import Order, Run
-from scenarios.catalogue import find
-from sensor_node.shell import NodeShell
-from sensor_node.tracker import LocalTracker
-from studies.run_folder import RunFolder
+from waldnet.common import clock, health, notice
+from waldnet.common.clock import now_ns
+from waldnet.common.codec import decode, encode
+from waldnet.common.config import Network, Scenario, load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.health import Health
+from waldnet.common.inbox import Heard, Inbox
+from waldnet.common.memory import MemoryNetwork
+from waldnet.common.messages import NEVER, Clock, Join, Keys, Report, Scan, Start
+from waldnet.common.notice import Notice
+from waldnet.common.quantities import NS_PER_S
+from waldnet.common.transport import Bus, open_zenoh
+from waldnet.fusion_center.center import Center
+from waldnet.fusion_center.shell import CenterShell
+from waldnet.launch.run import Order, Run
+from waldnet.recording.run_folder import RunFolder
+from waldnet.scenarios.catalogue import find
+from waldnet.sensor_node.shell import NodeShell
+from waldnet.sensor_node.tracker import LocalTracker
 
 
 class Sensor:

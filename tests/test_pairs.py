@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.pairs import CUTOFF_M, SETTLED_S, Job, played, rows, table
-from common.config import Scenario, load_scenario
-from common.messages import Tracks
-from scenarios.catalogue import find
-from scenarios.world import Truth, truth
-from studies.pairs import Outcome, judge, play
-from studies.shares import share_of
+from waldnet.benchmarks.pairs import CUTOFF_M, SETTLED_S, Job, played, rows, table
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.messages import Tracks
+from waldnet.scenarios.catalogue import find
+from waldnet.scenarios.world import Truth, truth
+from waldnet.studies.pairs import Outcome, judge, play
+from waldnet.studies.shares import share_of
 
 #: Runs, and so many at least keep all tracks: were a run kept with 95 %, fewer would be in 3 % of the cases.
 RUNS, KEPT = 6, 5

@@ -16,20 +16,20 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.types.state import GaussianState
 
-from benchmarks.peer_models import detections_of, eyes_of, instant, start_of, x_of
-from benchmarks.peer_tracker import PeerTracker, Settings, changed, run, tuned
-from benchmarks.real_runs import shorter, table, track, variants
-from benchmarks.real_truth import rules_of, times_of, truth_of
-from common.config import Scenario, load_scenario
-from common.errors import ConfigError
-from common.estimation.gaussian import Array
-from common.messages import Scan
-from scenarios.catalogue import find
-from scenarios.truth import Whereabouts
-from sensor_node.sources import all_scans
-from studies.evaluate.evaluation import Rules, judge
-from studies.evaluate.paths import targets_at
-from studies.evaluate.runs import read_run
+from waldnet.benchmarks.peer_models import detections_of, eyes_of, instant, start_of, x_of
+from waldnet.benchmarks.peer_tracker import PeerTracker, Settings, changed, run, tuned
+from waldnet.benchmarks.real_runs import shorter, table, track, variants
+from waldnet.benchmarks.real_truth import rules_of, times_of, truth_of
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import Scan
+from waldnet.evaluation.evaluation import Rules, judge
+from waldnet.evaluation.paths import targets_at
+from waldnet.evaluation.runs import read_run
+from waldnet.scenarios.catalogue import find
+from waldnet.scenarios.truth import Whereabouts
+from waldnet.sensor_node.sources import all_scans
 
 SETTINGS = Settings(min_points=4, holding_s=5.0, deleter_s=6.0, max_sigma_m=100.0)
 #: A sensor stands here, and a target is there.

@@ -13,13 +13,13 @@ from builders import all_same, scenario, sensor_table
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.config import Scenario
-from common.errors import PlotsError
-from common.limits import MAX_VALUE
-from common.messages import Scan
-from scenarios import catalogue
-from scenarios.plots import in_order, read_plots, write_plots
-from scenarios.world import simulate_all
+from waldnet.common.config import Scenario
+from waldnet.common.errors import PlotsError
+from waldnet.common.limits import MAX_VALUE
+from waldnet.common.messages import Scan
+from waldnet.scenarios import catalogue
+from waldnet.scenarios.plots import in_order, read_plots, write_plots
+from waldnet.scenarios.world import simulate_all
 
 PLOT = scenario()
 LINE: dict[str, Any] = {"sensor": "a", "time": 2.0, "plots": [[1.0, 2.0]]}

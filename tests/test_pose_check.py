@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from builders import scenario, sensor_table
 
-from common.estimation.gaussian import Array
-from common.messages import Scan
-from launch.checks import findings
-from scenarios.pose_check import pose_findings
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import Scan
+from waldnet.launch.checks import findings
+from waldnet.scenarios.pose_check import pose_findings
 
 DISC = {"shape": "disc", "radius": 2000.0}
 PLOT = scenario(sensor_table("a", kind="polar-doppler", sigma=[5.0, 0.01, 0.2], field_of_view=DISC))

@@ -9,12 +9,12 @@ import pytest
 from builders import live_as_replayed, only, scenario, sensor_table
 from numpy.typing import NDArray
 
-from common.config import Scenario
-from common.messages import Scan, Tracks
-from scenarios.precision_check import precision_faults
-from scenarios.scenario_check import scenario_findings
-from scenarios.world import simulate_all
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.messages import Scan, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.precision_check import precision_faults
+from waldnet.scenarios.scenario_check import scenario_findings
+from waldnet.scenarios.world import simulate_all
 
 Array = NDArray[np.float64]
 UTM = np.array([388_100.2, 3_949_000.1])

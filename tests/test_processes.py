@@ -38,20 +38,20 @@ from process_helpers import (
     variant,
 )
 
-from common.codec import VERSION, encode
-from common.config import Network, Scenario, load_scenario
-from common.estimation.sprt import Status
-from common.messages import Clock, Join, Keys, Report, Scan, Start, Tracks
-from common.quantities import NS_PER_S
-from common.transport import open_zenoh
-from fusion_center.state import Presence
-from scenarios.catalogue import find
-from scenarios.plots import read_plots
-from sensor_node.sources import all_scans
-from studies.lines import TrackLines
-from studies.network import run_in_memory
-from studies.record import Record
-from studies.replay import Replay
+from waldnet.common.codec import VERSION, encode
+from waldnet.common.config import Network, Scenario, load_scenario
+from waldnet.common.estimation.sprt import Status
+from waldnet.common.messages import Clock, Join, Keys, Report, Scan, Start, Tracks
+from waldnet.common.quantities import NS_PER_S
+from waldnet.common.transport import open_zenoh
+from waldnet.fusion_center.state import Presence
+from waldnet.offline.network import run_in_memory
+from waldnet.offline.replay import Replay
+from waldnet.recording.lines import TrackLines
+from waldnet.recording.record import Record
+from waldnet.scenarios.catalogue import find
+from waldnet.scenarios.plots import read_plots
+from waldnet.sensor_node.sources import all_scans
 
 pytestmark = pytest.mark.processes
 
@@ -204,7 +204,7 @@ def test_a_sensor_that_dies_does_not_end_the_run(processes: Processes, tmp_path:
     path = variant(tmp_path, "patient", PATIENT, ("duration = 60.0", "duration = 160.0"), *STEADY, kept)
     run = processes.run(path, "--speed", "20", "--out", "out")
     run.await_line("track 0 confirmed")
-    processes.kill("sensor_node", "radar-2")
+    processes.kill("waldnet.sensor_node", "radar-2")
     run.await_line("sensor radar-2 died (killed by SIGKILL); the run goes on with the others")
     assert run.wait() == 0, run.err
     assert run.err == []
@@ -247,7 +247,7 @@ def test_a_center_that_dies_ends_the_run(processes: Processes, tmp_path: Path) -
     path = variant(tmp_path, "long", ("duration = 60.0", "duration = 600.0"), of="four-radars-0.2")
     run = processes.run(path, "--speed", "8", "--out", "out")
     run.await_line("track 4 deleted")  # a scan after the confirmation, so that has been heard of for certain
-    processes.kill("fusion_center")
+    processes.kill("waldnet.fusion_center")
     assert run.wait() == 1
     assert len(run.err) == 1
     assert run.err[0].startswith("the fusion center died (killed by SIGKILL)")

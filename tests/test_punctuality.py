@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from builders import Stage, hypothesis_table, only, scenario, sensor_table
 
-from common import clock, notice
-from common.clock import now_ns
-from common.errors import DecodeError
-from common.memory import MemoryNetwork
-from common.messages import Keys, Tracks
-from common.notice import Notice
-from fusion_center.punctuality import CENTER, Punctuality
-from fusion_center.silence import PATIENCE_NS, Silence
-from scenarios.world import simulate_all
-from studies.network import run_in_memory
-from studies.record import Record
-from studies.replay import Replay
+from waldnet.common import clock, notice
+from waldnet.common.clock import now_ns
+from waldnet.common.errors import DecodeError
+from waldnet.common.memory import MemoryNetwork
+from waldnet.common.messages import Keys, Tracks
+from waldnet.common.notice import Notice
+from waldnet.fusion_center.punctuality import CENTER, Punctuality
+from waldnet.fusion_center.silence import PATIENCE_NS, Silence
+from waldnet.offline.network import run_in_memory
+from waldnet.offline.replay import Replay
+from waldnet.recording.record import Record
+from waldnet.scenarios.world import simulate_all
 
 NAMES = ("a", "b", "c", "d")
 
@@ -146,7 +146,7 @@ def test_a_network_goes_on_when_the_clock_is_set(monkeypatch: pytest.MonkeyPatch
             super().__init__()
             self.bus().subscribe(Keys(plot.network.name).tracks(), lambda *_: went_on.set())
 
-    monkeypatch.setattr("studies.network.MemoryNetwork", Watched)
+    monkeypatch.setattr("waldnet.offline.network.MemoryNetwork", Watched)
     monkeypatch.setattr(clock.time, "time_ns", lambda: real() + by_s * 10**9 * went_on.is_set())
     live = run_in_memory(plot, scans, speed=20.0)
     replayed = Record(plot)

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 from builders import hypothesis_table, scenario, sensor_table
 
-from common.config import Scenario, load_scenario
-from common.estimation.gaussian import Array
-from common.messages import Scan
-from launch.checks import describe, recording_table, warn
-from scenarios.catalogue import find, names
-from scenarios.plots import read_plots
-from scenarios.recording_check import recording_findings, summarise
-from scenarios.scenario_check import Finding, scenario_findings
-from scenarios.world import simulate_all
-from sensor_node.sources import spaced
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.messages import Scan
+from waldnet.launch.checks import describe, recording_table, warn
+from waldnet.scenarios.catalogue import find, names
+from waldnet.scenarios.plots import read_plots
+from waldnet.scenarios.recording_check import recording_findings, summarise
+from waldnet.scenarios.scenario_check import Finding, scenario_findings
+from waldnet.scenarios.world import simulate_all
+from waldnet.sensor_node.sources import spaced
 
 RECORDED = sorted(name for name in names() if load_scenario(find(name)).recording)
 SIMULATED = ["crossing", "four-radars", "heavy-clutter", "mixed-sensors", "no-target", "parallel", "rarely-seen"]

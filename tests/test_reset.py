@@ -12,20 +12,20 @@ from builders import Node, Stage, all_same, hypothesis_table, only, same, scenar
 from process_helpers import assert_agree, points_of
 from reference import Density, folded
 
-from common.codec import encode
-from common.config import Scenario
-from common.estimation.pose import SensorPose
-from common.memory import MemoryNetwork
-from common.messages import NEVER, Advice, Clock, Join, Keys, Message, Rebase, Report, Scan, Start, Stop, Tracks
-from common.quantities import NS_PER_S
-from fusion_center.state import Presence
-from scenarios.world import simulate_all
-from sensor_node.shell import NodeShell
-from sensor_node.state import State
-from sensor_node.tracker import LocalTracker
-from studies.network import run_in_memory
-from studies.record import Record
-from studies.replay import Replay
+from waldnet.common.codec import encode
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.memory import MemoryNetwork
+from waldnet.common.messages import NEVER, Advice, Clock, Join, Keys, Message, Rebase, Report, Scan, Start, Stop, Tracks
+from waldnet.common.quantities import NS_PER_S
+from waldnet.fusion_center.state import Presence
+from waldnet.offline.network import run_in_memory
+from waldnet.offline.replay import Replay
+from waldnet.recording.record import Record
+from waldnet.scenarios.world import simulate_all
+from waldnet.sensor_node.shell import NodeShell
+from waldnet.sensor_node.state import State
+from waldnet.sensor_node.tracker import LocalTracker
 
 UNDECIDED = {"enabled": False}
 CERTAIN = {"p_d": 1.0, "false_plots": 1e-6}

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from builders import scenario, sensor_table, write_report
 
-from scenarios.world import simulate_all
-from studies import figures, sketch
-from studies.record import Record
-from studies.replay import Replay
+from waldnet.offline.replay import Replay
+from waldnet.recording import figures, sketch
+from waldnet.recording.record import Record
+from waldnet.scenarios.world import simulate_all
 
 
 def test_of_many_tracks_those_that_were_confirmed_are_drawn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 from builders import Stage, hypothesis_table, only, reports_of, scenario, sensor_table, write_report
 
-from common.config import Scenario
-from common.decision_filter import DecisionFilter
-from common.errors import ConfigError
-from common.estimation.sprt import Status
-from common.messages import Decision, Message, Scan, Tracks
-from scenarios.world import simulate_all
-from studies import sketch
-from studies.inputs import Source
-from studies.lines import TrackLines, decision_entry
-from studies.record import Record
-from studies.replay import Replay
-from studies.run_folder import RunFolder, refuse_used
-from studies.sketch import ThinnedRows
+from waldnet.common.config import Scenario
+from waldnet.common.decision_filter import DecisionFilter
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.sprt import Status
+from waldnet.common.messages import Decision, Message, Scan, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.recording import sketch
+from waldnet.recording.inputs import Source
+from waldnet.recording.lines import TrackLines, decision_entry
+from waldnet.recording.record import Record
+from waldnet.recording.run_folder import RunFolder, refuse_used
+from waldnet.recording.sketch import ThinnedRows
+from waldnet.scenarios.world import simulate_all
 
 STARTING = {"hypothesis": [], "initiation": {"speed": 100.0}}
 

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from process_helpers import ANY_PORT, PATIENCE_S, Processes
 
-from common.config import load_scenario
-from scenarios.plots import read_plots
+from waldnet.common.config import load_scenario
+from waldnet.scenarios.plots import read_plots
 
 pytestmark = pytest.mark.processes
 

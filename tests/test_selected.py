@@ -12,16 +12,16 @@ from builders import Node, Stage, hypothesis_table, only, scenario, sensor_table
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from common.codec import decode, encode
-from common.config import ConfigError, Scenario, load_scenario
-from common.estimation.association import Clutter, Plots, expect
-from common.estimation.gaussian import Gaussian
-from common.estimation.selection import Selection, select
-from common.estimation.sensing import Position
-from common.messages import NEVER, Keys, Picked, Report, Scan, Tracks
-from scenarios.world import simulate_all
-from studies.network import run_in_memory
-from studies.replay import Replay
+from waldnet.common.codec import decode, encode
+from waldnet.common.config import ConfigError, Scenario, load_scenario
+from waldnet.common.estimation.association import Clutter, Plots, expect
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.selection import Selection, select
+from waldnet.common.estimation.sensing import Position
+from waldnet.common.messages import NEVER, Keys, Picked, Report, Scan, Tracks
+from waldnet.offline.network import run_in_memory
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate_all
 
 Array = NDArray[np.float64]
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from builders import scenario, sensor_table
 
-from common.config import SensorConfig, load_scenario
-from common.errors import ConfigError
-from common.estimation.detection import Constant, Notch, Swerling
-from common.estimation.field_of_view import AllAround, Disc
-from common.estimation.polar import Bearing, Polar, PolarDoppler
-from common.estimation.sector import Sector
-from common.estimation.sensing import Measurement, Position, Sensor
-from common.estimation.sigma_points import SigmaPoint
+from waldnet.common.config import SensorConfig, load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.detection import Constant, Notch, Swerling
+from waldnet.common.estimation.field_of_view import AllAround, Disc
+from waldnet.common.estimation.polar import Bearing, Polar, PolarDoppler
+from waldnet.common.estimation.sector import Sector
+from waldnet.common.estimation.sensing import Measurement, Position, Sensor
+from waldnet.common.estimation.sigma_points import SigmaPoint
 
 RIGHT = 0.5 * np.pi
 DISC = {"shape": "disc", "radius": 5000.0}

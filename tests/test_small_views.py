@@ -10,13 +10,13 @@ import pytest
 from builders import hypothesis_table, only, scenario, sensor_table
 from numpy.typing import NDArray
 
-from common.config import Scenario
-from common.estimation.pose import SensorPose
-from common.messages import Scan, Tracks
-from studies import baselines
-from studies.centralised import Centralised
-from studies.course import Look, Worlds
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.messages import Scan, Tracks
+from waldnet.offline.centralised import Centralised
+from waldnet.offline.replay import Replay
+from waldnet.studies import baselines
+from waldnet.studies.course import Look, Worlds
 
 Array = NDArray[np.float64]
 

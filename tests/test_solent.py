@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from common.config import load_scenario
-from common.estimation.gaussian import Array
-from scenarios import catalogue
-from scenarios.solent.convert import LATITUDE, LONGITUDE, Report, main, read, smooth, to_local, trajectories
-from scenarios.trajectories import read_trajectories
+from waldnet.common.config import load_scenario
+from waldnet.common.estimation.gaussian import Array
+from waldnet.scenarios import catalogue
+from waldnet.scenarios.solent.convert import LATITUDE, LONGITUDE, Report, main, read, smooth, to_local, trajectories
+from waldnet.scenarios.trajectories import read_trajectories
 
 FOLDER = catalogue.FOLDER / "solent"
 HEAD = "Time,MMSI,Latitude_degrees,Longitude_degrees,COG_degrees,SOG_knots"

@@ -15,15 +15,15 @@ import study_fakes
 from builders import scenario, sensor_table
 from process_helpers import WALDNET, Process, Processes
 
-from common.errors import ConfigError, StudyError, TransportError, WaldnetError
-from studies import workers
-from studies.cli import study as command
-from studies.parts import Store
-from studies.plan import Order, to_toml
-from studies.report import SHEETS
-from studies.study import Study, join
-from studies.tables import csv_of
-from studies.workers import Part, play_jobs
+from waldnet.common.errors import ConfigError, StudyError, TransportError, WaldnetError
+from waldnet.studies import workers
+from waldnet.studies.cli import study as command
+from waldnet.studies.parts import Store
+from waldnet.studies.plan import Order, to_toml
+from waldnet.studies.report import SHEETS
+from waldnet.studies.study import Study, join
+from waldnet.studies.tables import csv_of
+from waldnet.studies.workers import Part, play_jobs
 
 PLOT = scenario(simulation={"duration": 8.0})
 ORDER = Order(modes=("naive", "dkf"), runs=7, seed=3, p_d=(0.9, 0.4), no_target=True, block=3)
@@ -123,7 +123,7 @@ def test_parts_of_another_study_are_not_mixed_in(
 
 def test_another_program_is_another_study(fakes: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     done(tmp_path / "s")
-    monkeypatch.setattr("studies.study.program_digest", lambda: "other")
+    monkeypatch.setattr("waldnet.studies.study.program_digest", lambda: "other")
     with pytest.raises(ConfigError, match="another version of waldnet or of NumPy"):
         Study(PLOT, ORDER, tmp_path / "s")
 
@@ -199,7 +199,7 @@ def test_the_command_writes_tables_report_and_scenarios(
     fakes: None, file: Path, tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    monkeypatch.setattr("studies.report.SHEETS", SHEETS[:1])
+    monkeypatch.setattr("waldnet.studies.report.SHEETS", SHEETS[:1])
     command(str(file), modes="naive, dkf,naive", runs=5, seed=2, p_d="0.9,0.3", no_target=True, out=out, block=4)
     said = capsys.readouterr()
     assert [line for line in said.err.splitlines() if "done" in line] == [
@@ -231,7 +231,7 @@ def test_the_command_writes_tables_report_and_scenarios(
 def test_the_seed_is_the_scenarios_unless_given(
     fakes: None, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("studies.report.SHEETS", ())
+    monkeypatch.setattr("waldnet.studies.report.SHEETS", ())
     command(str(file), modes="naive", runs=1, out=tmp_path / "out")
     assert json.loads((tmp_path / "out/study.json").read_text())["seed"] == 1
 

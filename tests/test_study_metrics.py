@@ -12,10 +12,10 @@ from scipy.stats import binom
 from stonesoup.metricgenerator.ospametric import GOSPAMetric
 from stonesoup.types.state import State
 
-from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Status, Thresholds, decide, thresholds
-from studies.course import Course, Worlds
-from studies.gospa import gospa, gospa_of_one
-from studies.metrics import (
+from waldnet.common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Status, Thresholds, decide, thresholds
+from waldnet.studies.course import Course, Worlds
+from waldnet.studies.gospa import gospa, gospa_of_one
+from waldnet.studies.metrics import (
     Evidence,
     Result,
     evidence,
@@ -26,7 +26,7 @@ from studies.metrics import (
     monitor,
     reduce,
 )
-from studies.shares import quantile, share_of
+from waldnet.studies.shares import quantile, share_of
 
 LIMITS = thresholds(1e-2, 0.9)  # log A = -2.29, log B = 4.50
 seeds = st.integers(0, 2**32 - 1)

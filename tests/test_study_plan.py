@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from builders import hypothesis_table, scenario, sensor_table
 
-from common.config import Scenario, load_scenario
-from common.errors import ConfigError
-from scenarios import catalogue
-from studies.plan import (
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.scenarios import catalogue
+from waldnet.studies.plan import (
     Job,
     Order,
     Variant,

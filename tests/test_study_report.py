@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from studies.plan import Order
-from studies.report import SHEETS, Sheet, write_report
-from studies.report_figures import Scene
-from studies.report_frontier import spaced
-from studies.report_style import look
-from studies.study import Study
+from waldnet.evaluation.style import look
+from waldnet.studies.plan import Order
+from waldnet.studies.report import SHEETS, Sheet, write_report
+from waldnet.studies.report_figures import Scene
+from waldnet.studies.report_frontier import spaced
+from waldnet.studies.study import Study
 
 PLOT = scenario(name="a.b")
 
@@ -55,7 +55,7 @@ def test_the_report_has_all_figures_and_needs_nothing_else(fakes: None, tmp_path
 
 
 def test_the_report_is_the_same_every_time(fakes: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("studies.report.SHEETS", SHEETS[:1])
+    monkeypatch.setattr("waldnet.studies.report.SHEETS", SHEETS[:1])
     order = Order(("naive",), runs=3, seed=1)
     assert report_of(tmp_path / "s", order) == report_of(tmp_path / "s", order)
 
@@ -63,7 +63,7 @@ def test_the_report_is_the_same_every_time(fakes: None, tmp_path: Path, monkeypa
 def test_without_a_target_there_is_no_accuracy_and_without_the_rest_no_calibration(
     fakes: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("studies.report._draw", lambda *_: "")
+    monkeypatch.setattr("waldnet.studies.report._draw", lambda *_: "")
     order = Order(("naive", "dkf"), runs=3, seed=1, p_d=(0.9, 0.5))
     without = titles(report_of(tmp_path / "without", order, scenario(target=[])))
     assert without == ["overview", "log_lr", "decided", "thresholds", "calibration"]
@@ -88,8 +88,8 @@ def test_what_there_is_nothing_of_is_not_drawn(
         figure.draw_without_rendering()
         return ""
 
-    monkeypatch.setattr("studies.modes.play", play)
-    monkeypatch.setattr("studies.report._draw", draw)
+    monkeypatch.setattr("waldnet.studies.modes.play", play)
+    monkeypatch.setattr("waldnet.studies.report._draw", draw)
     order = Order(("centralised", "naive"), runs=1 if case == "one run" else 4, seed=1, no_target=True)
     assert titles(report_of(tmp_path / "s", order)) == [sheet.name for sheet in SHEETS]
 

@@ -12,11 +12,11 @@ import pytest
 import study_fakes
 from builders import hypothesis_table, scenario
 
-from common.estimation.sprt import thresholds
-from studies import calibration
-from studies.metrics import reduce
-from studies.plan import Variant, with_p_d, world_seeds
-from studies.tables import (
+from waldnet.common.estimation.sprt import thresholds
+from waldnet.studies import calibration
+from waldnet.studies.metrics import reduce
+from waldnet.studies.plan import Variant, with_p_d, world_seeds
+from waldnet.studies.tables import (
     GRID,
     Play,
     csv_of,

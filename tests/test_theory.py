@@ -18,11 +18,11 @@ from scipy.integrate import quad
 from scipy.special import logsumexp
 from scipy.stats import chi2, norm
 
-from common.config import Scenario
-from common.messages import NEVER, Advice, Decision, Scan, Start, Tracks
-from sensor_node.state import State as NodeState
-from sensor_node.tracker import LocalTracker
-from studies.replay import Replay
+from waldnet.common.config import Scenario
+from waldnet.common.messages import NEVER, Advice, Decision, Scan, Start, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.sensor_node.state import State as NodeState
+from waldnet.sensor_node.tracker import LocalTracker
 
 Config: TypeAlias = dict[str, Any]
 

@@ -12,16 +12,16 @@ from builders import scenario, sensor_table
 from rich.console import Console
 from structlog.testing import capture_logs
 
-from common import logs
-from common.decision_filter import DecisionFilter
-from common.estimation.sprt import Status
-from common.logs import Complaints
-from common.messages import Decision, DecisionKind, Tracks
-from common.quantities import NS_PER_S
-from launch.status import LiveStatus
-from launch.watch import clock_text
-from scenarios.world import simulate_all
-from studies.network import run_in_memory
+from waldnet.common import logs
+from waldnet.common.decision_filter import DecisionFilter
+from waldnet.common.estimation.sprt import Status
+from waldnet.common.logs import Complaints
+from waldnet.common.messages import Decision, DecisionKind, Tracks
+from waldnet.common.quantities import NS_PER_S
+from waldnet.launch.status import LiveStatus
+from waldnet.launch.watch import clock_text
+from waldnet.offline.network import run_in_memory
+from waldnet.scenarios.world import simulate_all
 
 STARTING: dict[str, Any] = {"hypothesis": [], "initiation": {"speed": 100.0}}
 

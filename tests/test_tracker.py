@@ -7,16 +7,16 @@ import pytest
 from builders import Node, same, scenario, sensor_table
 from scipy import stats
 
-from common.config import Scenario
-from common.errors import ConfigError
-from common.estimation.gaussian import Gaussian
-from common.estimation.motion import ConstantVelocity
-from common.estimation.representation import Share
-from common.messages import NEVER, Advice, Scan, Start, Stop
-from scenarios.world import simulate, simulate_all
-from sensor_node.sources import schedule_of
-from sensor_node.state import Tracks
-from sensor_node.tracker import LocalTracker
+from waldnet.common.config import Scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.motion import ConstantVelocity
+from waldnet.common.estimation.representation import Share
+from waldnet.common.messages import NEVER, Advice, Scan, Start, Stop
+from waldnet.scenarios.world import simulate, simulate_all
+from waldnet.sensor_node.sources import schedule_of
+from waldnet.sensor_node.state import Tracks
+from waldnet.sensor_node.tracker import LocalTracker
 
 CONFIGURATIONS = [
     ("federated", "tight"),

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from builders import all_same, scenario, sensor_table
 
-from common.config import Scenario, load_scenario
-from common.errors import TruthError
-from scenarios.trajectories import read_trajectories
-from scenarios.world import simulate, simulate_all, truth
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.errors import TruthError
+from waldnet.scenarios.trajectories import read_trajectories
+from waldnet.scenarios.world import simulate, simulate_all, truth
 
 LINE: dict[str, Any] = {"target": 1, "time": 2.0, "position": [1.0, 2.0]}
 #: A target that turns a corner, and one that is there for a moment.

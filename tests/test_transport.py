@@ -15,11 +15,11 @@ from typing import Any
 
 import pytest
 
-from common import transport
-from common.config import Network
-from common.errors import TransportError
-from common.memory import MemoryNetwork
-from common.transport import Bus, Publisher, open_zenoh
+from waldnet.common import transport
+from waldnet.common.config import Network
+from waldnet.common.errors import TransportError
+from waldnet.common.memory import MemoryNetwork
+from waldnet.common.transport import Bus, Publisher, open_zenoh
 
 PATIENCE_S = 20
 ANY_PORT = "tcp/127.0.0.1:0"
@@ -654,8 +654,8 @@ def test_closing_amid_traffic_does_not_hang(join_zenoh: Join) -> None:
 
 USE_EVERYTHING = """
 import sys
-from common.config import Network
-from common.transport import open_zenoh
+from waldnet.common.config import Network
+from waldnet.common.transport import open_zenoh
 bus = open_zenoh(Network(listen=("tcp/127.0.0.1:0",), connect=tuple(sys.argv[1:])))
 ignore = lambda *_: None
 bus.subscribe("net/**", ignore, history=1, on_miss=ignore)

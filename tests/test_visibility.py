@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from builders import hypothesis_table, only, scenario, sensor_table
 
-from common.config import Scenario, load_scenario
-from common.errors import ConfigError
-from common.estimation.visibility import Visibility, seen
-from common.messages import Scan, Tracks
-from scenarios.world import simulate, simulate_all
-from sensor_node.sources import all_scans, source
-from studies.plan import Order, check
-from studies.replay import Replay
+from waldnet.common.config import Scenario, load_scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.visibility import Visibility, seen
+from waldnet.common.messages import Scan, Tracks
+from waldnet.offline.replay import Replay
+from waldnet.scenarios.world import simulate, simulate_all
+from waldnet.sensor_node.sources import all_scans, source
+from waldnet.studies.plan import Order, check
 
 LOSES = {"visible_for": 12.0, "hidden_for": 6.0}
 #: Covers all: every target is inside.

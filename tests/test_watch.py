@@ -21,9 +21,9 @@ from process_helpers import (
     variant,
 )
 
-from common.config import Network
-from common.transport import open_zenoh
-from scenarios.catalogue import find
+from waldnet.common.config import Network
+from waldnet.common.transport import open_zenoh
+from waldnet.scenarios.catalogue import find
 
 pytestmark = pytest.mark.processes
 

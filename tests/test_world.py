@@ -7,10 +7,10 @@ import pytest
 from builders import all_same, hypothesis_table, scenario, sensor_table
 from scipy import stats
 
-from common.config import Scenario
-from common.errors import ConfigError
-from common.estimation.gaussian import draw_noise
-from scenarios.world import scan_times_ns, simulate, simulate_all, truth
+from waldnet.common.config import Scenario
+from waldnet.common.errors import ConfigError
+from waldnet.common.estimation.gaussian import draw_noise
+from waldnet.scenarios.world import scan_times_ns, simulate, simulate_all, truth
 
 #: Probability that a statistical test fails though the code is right; seeds are fixed, so it fails always or never.
 ALPHA = 1e-3

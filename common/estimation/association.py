@@ -17,9 +17,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from scipy.special import gammaincinv
 
-from common.estimation.field_of_view import View
-from common.estimation.gating import IntArray, Near, inside_boxes
-from common.estimation.gaussian import (
+from waldnet.common.estimation.field_of_view import View
+from waldnet.common.estimation.gating import IntArray, Near, inside_boxes
+from waldnet.common.estimation.gaussian import (
     LOG_2PI,
     Array,
     BoolArray,
@@ -31,7 +31,7 @@ from common.estimation.gaussian import (
     symmetric,
     times_transposed,
 )
-from common.estimation.sensing import Linearised
+from waldnet.common.estimation.sensing import Linearised
 
 #: Up to so many pairs of track and plot it is cheaper to look at all of them.
 _FEW_PAIRS = 4000

@@ -22,15 +22,15 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import gammaln
 
-from common.estimation.association import in_view, innovations, log_weights
-from common.estimation.batch import take
-from common.estimation.detection import Notch
-from common.estimation.extraction import SensorScan, expected_of, in_order, weighed
-from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array, Gaussian, log_sum_exp, squared_norm, times_transposed
-from common.estimation.motion import Motion, predict
-from common.estimation.notch import hypotheses
-from common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
+from waldnet.common.estimation.association import in_view, innovations, log_weights
+from waldnet.common.estimation.batch import take
+from waldnet.common.estimation.detection import Notch
+from waldnet.common.estimation.extraction import SensorScan, expected_of, in_order, weighed
+from waldnet.common.estimation.gating import IntArray
+from waldnet.common.estimation.gaussian import Array, Gaussian, log_sum_exp, squared_norm, times_transposed
+from waldnet.common.estimation.motion import Motion, predict
+from waldnet.common.estimation.notch import hypotheses
+from waldnet.common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
 
 
 class Joint(NamedTuple):

@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.sensing import Sensor
+from waldnet.common.estimation.gating import IntArray
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.sensing import Sensor
 
 #: What has faded below this share of the prior's shape, or of a scan, is dropped.
 _FADED = 1e-3

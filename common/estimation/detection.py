@@ -6,9 +6,9 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from common.estimation.gaussian import Array, Gaussian, cholesky
-from common.estimation.quadrature import product_points
-from common.estimation.sight import approach, radial_speed
+from waldnet.common.estimation.gaussian import Array, Gaussian, cholesky
+from waldnet.common.estimation.quadrature import product_points
+from waldnet.common.estimation.sight import approach, radial_speed
 
 
 class Detection(Protocol):

@@ -15,16 +15,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import Clutter, Expected, Plots, expect, within_reach
-from common.estimation.batch import concatenate, take
-from common.estimation.detection import Notch
-from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
-from common.estimation.mixture import Mixture, Reduction, step, step_with
-from common.estimation.motion import Motion, predict
-from common.estimation.notch import hypotheses
-from common.estimation.sensing import Sensor
-from common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
+from waldnet.common.estimation.association import Clutter, Expected, Plots, expect, within_reach
+from waldnet.common.estimation.batch import concatenate, take
+from waldnet.common.estimation.detection import Notch
+from waldnet.common.estimation.gating import IntArray
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
+from waldnet.common.estimation.mixture import Mixture, Reduction, step, step_with
+from waldnet.common.estimation.motion import Motion, predict
+from waldnet.common.estimation.notch import hypotheses
+from waldnet.common.estimation.sensing import Sensor
+from waldnet.common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
 
 
 class SensorScan(NamedTuple):

@@ -20,8 +20,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from scipy.special import gamma, owens_t
 
-from common.estimation.gaussian import Array, BoolArray, Gaussian
-from common.estimation.quadrature import CERTAIN, Indices, decide, integrate, interval, normal
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian
+from waldnet.common.estimation.quadrature import CERTAIN, Indices, decide, integrate, interval, normal
 
 # In radii. An edge is known to 16 digits, and a sigma must keep more of them than the tolerance asks for, or bisection
 # chases noise. The floor also mends the variance of a needle's narrow axis where rounding made it negative.

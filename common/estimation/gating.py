@@ -7,7 +7,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.gaussian import Array, BoolArray
 
 IntArray: TypeAlias = NDArray[np.intp]
 

@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import Clutter, Plots, pdaf
-from common.estimation.gaussian import Array, Gaussian, draw_noise, log_sum_exp, moments
-from common.estimation.motion import (
+from waldnet.common.estimation.association import Clutter, Plots, pdaf
+from waldnet.common.estimation.gaussian import Array, Gaussian, draw_noise, log_sum_exp, moments
+from waldnet.common.estimation.motion import (
     ConstantAcceleration,
     ConstantVelocity,
     CoordinatedTurn,
@@ -28,7 +28,7 @@ from common.estimation.motion import (
     Motion,
     predict,
 )
-from common.estimation.sensing import Linearised
+from waldnet.common.estimation.sensing import Linearised
 
 
 class Imm(NamedTuple):

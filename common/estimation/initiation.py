@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from common.estimation.association import innovations
-from common.estimation.gating import IntArray, inside_boxes
-from common.estimation.gaussian import (
+from waldnet.common.estimation.association import innovations
+from waldnet.common.estimation.gating import IntArray, inside_boxes
+from waldnet.common.estimation.gaussian import (
     Array,
     BoolArray,
     Gaussian,
@@ -18,8 +18,8 @@ from common.estimation.gaussian import (
     symmetric,
     times_transposed,
 )
-from common.estimation.motion import Motion, predict
-from common.estimation.sensing import Measurement
+from waldnet.common.estimation.motion import Motion, predict
+from waldnet.common.estimation.sensing import Measurement
 
 #: Standard deviation of a position around which a measurement is linearised [m].
 _POINT = 1e-3

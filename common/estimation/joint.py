@@ -18,8 +18,8 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array, BoolArray, log_sum_exp
+from waldnet.common.estimation.gating import IntArray
+from waldnet.common.estimation.gaussian import Array, BoolArray, log_sum_exp
 
 #: Clusters of up to so many tracks are solved exactly; the work doubles with every track.
 MOST_EXACT = 8

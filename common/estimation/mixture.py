@@ -14,10 +14,18 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import Expected, Plots, in_view, innovations, within_reach
-from common.estimation.batch import take
-from common.estimation.gating import IntArray
-from common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp, quadratic, squared_norm, symmetric
+from waldnet.common.estimation.association import Expected, Plots, in_view, innovations, within_reach
+from waldnet.common.estimation.batch import take
+from waldnet.common.estimation.gating import IntArray
+from waldnet.common.estimation.gaussian import (
+    Array,
+    BoolArray,
+    Gaussian,
+    log_sum_exp,
+    quadratic,
+    squared_norm,
+    symmetric,
+)
 
 
 class Mixture(NamedTuple):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import (
+from waldnet.common.estimation.gaussian import (
     LOG_2PI,
     Array,
     Gaussian,

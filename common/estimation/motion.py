@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
-from common.estimation.gaussian import Array, Gaussian, identity, symmetric, times_transposed
+from waldnet.common.estimation.gaussian import Array, Gaussian, identity, symmetric, times_transposed
 
 #: Of the power series of (theta - sin theta) / theta^3: 6 / (2 k + 3)! is below 1e-16 from k = 8 on.
 _TERMS = 8

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import (
+from waldnet.common.estimation.association import (
     Choice,
     Expected,
     Filtered,
@@ -31,9 +31,9 @@ from common.estimation.association import (
     log_weights,
     normalise,
 )
-from common.estimation.detection import Notch, log_blind
-from common.estimation.gaussian import Array, Gaussian, moments, symmetric, times_transposed
-from common.estimation.sight import approach
+from waldnet.common.estimation.detection import Notch, log_blind
+from waldnet.common.estimation.gaussian import Array, Gaussian, moments, symmetric, times_transposed
+from waldnet.common.estimation.sight import approach
 
 #: Smallest variance that is divided by, relative to v_n: of a state that is known exactly.
 _EXACT = 1e-30

@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.sensing import Linearised
-from common.estimation.sight import approach, look_at, radial_speed, to_cartesian, to_polar
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.sensing import Linearised
+from waldnet.common.estimation.sight import approach, look_at, radial_speed, to_cartesian, to_polar
 
 
 class Polar(NamedTuple):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array
+from waldnet.common.estimation.gaussian import Array
 
 
 class SensorPose(NamedTuple):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.gaussian import Array, BoolArray
 
 #: Sigmas beyond which nothing is left: Phi(-8.5) = 1e-17 vanishes beside 1.
 CERTAIN = 8.5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from common.estimation.gaussian import Array, Product
+from waldnet.common.estimation.gaussian import Array, Product
 
 
 def log_lambda(before: Product, after: Product, log_p_bar: Array) -> Array:

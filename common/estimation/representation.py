@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from common.estimation.gaussian import (
+from waldnet.common.estimation.gaussian import (
     Array,
     Gaussian,
     gram,
@@ -13,7 +13,7 @@ from common.estimation.gaussian import (
     symmetric,
     times_transposed,
 )
-from common.estimation.motion import Motion, predict
+from waldnet.common.estimation.motion import Motion, predict
 
 
 class Share(NamedTuple):

@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gating import IntArray
-from common.estimation.gaussian import (
+from waldnet.common.estimation.gating import IntArray
+from waldnet.common.estimation.gaussian import (
     Array,
     Gaussian,
     gram,
@@ -27,8 +27,8 @@ from common.estimation.gaussian import (
     symmetric,
     times_transposed,
 )
-from common.estimation.mixture import Ancestry, Mixture
-from common.estimation.motion import Motion
+from waldnet.common.estimation.mixture import Ancestry, Mixture
+from waldnet.common.estimation.motion import Motion
 
 
 class Generation(NamedTuple):

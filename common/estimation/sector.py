@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr
 
-from common.estimation.gaussian import Array, BoolArray, Gaussian
-from common.estimation.quadrature import CERTAIN, Indices, decide, integrate, normal
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian
+from waldnet.common.estimation.quadrature import CERTAIN, Indices, decide, integrate, normal
 
 # In radii, as in field_of_view.py.
 _SIGMA_MIN = 1e-7

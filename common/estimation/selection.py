@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.association import Expected, Plots, gate_threshold, innovations, inside_common_boxes
-from common.estimation.gating import inside_boxes
-from common.estimation.gaussian import Array, BoolArray, squared_norm
+from waldnet.common.estimation.association import Expected, Plots, gate_threshold, innovations, inside_common_boxes
+from waldnet.common.estimation.gating import inside_boxes
+from waldnet.common.estimation.gaussian import Array, BoolArray, squared_norm
 
 #: Up to so many pairs of component and plot it is cheaper to look at all of them.
 _FEW_PAIRS = 100_000

@@ -6,11 +6,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from common.estimation.detection import Constant, Detection, Notch
-from common.estimation.field_of_view import AllAround, Everywhere, FieldOfView, View
-from common.estimation.gaussian import Array, BoolArray, Gaussian
-from common.estimation.pose import SensorPose
-from common.estimation.visibility import Visibility
+from waldnet.common.estimation.detection import Constant, Detection, Notch
+from waldnet.common.estimation.field_of_view import AllAround, Everywhere, FieldOfView, View
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.visibility import Visibility
 
 
 class Linearised(NamedTuple):

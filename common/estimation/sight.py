@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.gaussian import Array, Gaussian
 
 #: Variance of an angle of which nothing is known, around the circle and from nadir to zenith [rad^2].
 _ANY_AZIMUTH, _ANY_ELEVATION = np.pi**2 / 3.0, np.pi**2 / 12.0

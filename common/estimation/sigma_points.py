@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array, Gaussian, cholesky
-from common.estimation.quadrature import sigma_points
-from common.estimation.sensing import Linearised, Measurement
+from waldnet.common.estimation.gaussian import Array, Gaussian, cholesky
+from waldnet.common.estimation.quadrature import sigma_points
+from waldnet.common.estimation.sensing import Linearised, Measurement
 
 
 class SigmaPoint(NamedTuple):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.gaussian import Array, BoolArray
 
 
 class Status(IntEnum):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.gaussian import Array, BoolArray
 
 
 class Visibility(NamedTuple):

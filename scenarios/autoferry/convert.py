@@ -1,6 +1,6 @@
 """Converts the Autoferry dataset to this project's JSON Lines.
 
-``python -m scenarios.autoferry.convert FOLDER_OF_THE_DATASET`` writes all scenarios anew, beside this module.
+``python -m waldnet.scenarios.autoferry.convert FOLDER_OF_THE_DATASET`` writes all scenarios anew, beside this module.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def write(recording: Recording, folder: Path, number: int) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code is 1, and nothing is written, when the dataset is wrong."""
-    parser = argparse.ArgumentParser(prog="python -m scenarios.autoferry.convert", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m waldnet.scenarios.autoferry.convert", description=__doc__)
     parser.add_argument("dataset", type=Path, help="folder that holds scenarioN_detections.json")
     parser.add_argument("--scenario", type=int, action="append", help=f"number, repeatable; without it: {SCENARIOS}")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent, help="folder to write to")

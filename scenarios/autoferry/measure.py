@@ -1,7 +1,7 @@
 """Measures the ferry's sensors against the truth of two boats.
 
-``python -m scenarios.autoferry.measure`` prints tables in Markdown from the files beside this module. A plot within
-25 m of a boat is the boat's, a bearing within 0.1 rad is; a plot is at most one boat's, and all others are false.
+``python -m waldnet.scenarios.autoferry.measure`` prints tables in Markdown from the files beside this module. A plot
+within 25 m of a boat is the boat's, a bearing within 0.1 rad is; a plot is at most one boat's, and all others are false.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array
-from common.estimation.sight import to_polar
-from scenarios.autoferry.convert import CAMERAS, SCENARIOS
-from scenarios.measure import assign
-from scenarios.persistence import LAG_S, Watch, correlation, fitted, watches
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.estimation.sight import to_polar
+from waldnet.scenarios.autoferry.convert import CAMERAS, SCENARIOS
+from waldnet.scenarios.measure import assign
+from waldnet.scenarios.persistence import LAG_S, Watch, correlation, fitted, watches
 
 #: Up to where a boat is looked for [m].
 REACH = {"radar": 500.0, "lidar": 125.0, "daylight": 300.0, "infrared": 300.0}
@@ -178,7 +178,7 @@ def tables(folder: Path) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m scenarios.autoferry.measure", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m waldnet.scenarios.autoferry.measure", description=__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=Path(__file__).parent, help="of scenarioN.jsonl")
     sys.stdout.write(tables(parser.parse_args(arguments).folder) + "\n")
     return 0

@@ -1,7 +1,7 @@
 """Measures the ship's radar against the truth of the boat, on each half of the recording.
 
-``python -m scenarios.joyride.measure`` prints tables in Markdown from the files beside this module. The plot nearest to
-the boat is the boat's where it lies within 50 m of it; all others are false.
+``python -m waldnet.scenarios.joyride.measure`` prints tables in Markdown from the files beside this module. The plot
+nearest to the boat is the boat's where it lies within 50 m of it; all others are false.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from common.estimation.gaussian import Array
-from scenarios.persistence import Watch, fitted
+from waldnet.common.estimation.gaussian import Array
+from waldnet.scenarios.persistence import Watch, fitted
 
 #: How far from the boat its plot may be [m].
 NEAR_M = 50.0
@@ -137,7 +137,7 @@ def _lines(path: Path) -> list[dict[str, Any]]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line."""
-    parser = argparse.ArgumentParser(prog="python -m scenarios.joyride.measure", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m waldnet.scenarios.joyride.measure", description=__doc__)
     parser.add_argument("folder", type=Path, nargs="?", default=Path(__file__).parent, help="of joyride.jsonl")
     sys.stdout.write(tables(parser.parse_args(arguments).folder) + "\n")
     return 0

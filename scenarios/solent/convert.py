@@ -1,6 +1,7 @@
 """Converts ship reports (AIS) in the Solent to trajectories as a simulation reads them.
 
-``python -m scenarios.solent.convert SolentAIS_20160112_130211.csv`` writes ``truth.jsonl`` anew, beside this module.
+``python -m waldnet.scenarios.solent.convert SolentAIS_20160112_130211.csv`` writes
+``truth.jsonl`` anew, beside this module.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
 
-from common.estimation.gaussian import Array
+from waldnet.common.estimation.gaussian import Array
 
 #: Of the local frame [degrees].
 LATITUDE, LONGITUDE = 50.75, -1.2
@@ -146,7 +147,7 @@ def write(path: Path, ships: Sequence[Trajectory]) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the exit code is 1, and nothing is written, when the reports are wrong."""
-    parser = argparse.ArgumentParser(prog="python -m scenarios.solent.convert", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m waldnet.scenarios.solent.convert", description=__doc__)
     parser.add_argument("reports", type=Path, help="SolentAIS_20160112_130211.csv")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "truth.jsonl", help="file to write")
     options = parser.parse_args(arguments)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.gaussian import Array, Gaussian
 
 
 @pytest.fixture(scope="session")

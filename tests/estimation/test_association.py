@@ -26,7 +26,7 @@ from stonesoup.types.state import GaussianState
 from stonesoup.types.track import Track
 from stonesoup.updater.probability import PDAUpdater
 
-from common.estimation.association import (
+from waldnet.common.estimation.association import (
     Choice,
     Clutter,
     Filtered,
@@ -40,10 +40,10 @@ from common.estimation.association import (
     pdaf,
     update,
 )
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.motion import ConstantVelocity, predict
-from common.estimation.representation import Share
-from common.estimation.sensing import Linearised, Position
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.motion import ConstantVelocity, predict
+from waldnet.common.estimation.representation import Share
+from waldnet.common.estimation.sensing import Linearised, Position
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

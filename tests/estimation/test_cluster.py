@@ -12,17 +12,17 @@ from enumeration import History, Problem, all_histories, joint_histories, log_li
 from scipy.special import logsumexp
 from scipy.stats import beta
 
-from common.estimation.association import Plots
-from common.estimation.cluster import Cluster, ClusterTest, cluster, extract_cluster
-from common.estimation.detection import Constant, Detection, Notch
-from common.estimation.extraction import Extractor, SensorScan, candidates, extract
-from common.estimation.field_of_view import Everywhere
-from common.estimation.gaussian import Gaussian
-from common.estimation.mixture import EXACT
-from common.estimation.motion import ConstantVelocity
-from common.estimation.polar import Polar
-from common.estimation.sensing import Position, Sensor
-from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds, thresholds
+from waldnet.common.estimation.association import Plots
+from waldnet.common.estimation.cluster import Cluster, ClusterTest, cluster, extract_cluster
+from waldnet.common.estimation.detection import Constant, Detection, Notch
+from waldnet.common.estimation.extraction import Extractor, SensorScan, candidates, extract
+from waldnet.common.estimation.field_of_view import Everywhere
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.mixture import EXACT
+from waldnet.common.estimation.motion import ConstantVelocity
+from waldnet.common.estimation.polar import Polar
+from waldnet.common.estimation.sensing import Position, Sensor
+from waldnet.common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds, thresholds
 
 MOTION = ConstantVelocity(2, 3.0)
 NEAR = Sensor(Position((4.0, 7.0), 4), 0.8, 12.0, Everywhere(4e4, 2))

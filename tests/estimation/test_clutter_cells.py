@@ -7,13 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from common.estimation import clutter_map
-from common.estimation.clutter_map import ClutterMap, ClutterModel, learn, log_relative
-from common.estimation.field_of_view import AllAround, Box, Disc, FieldOfView
-from common.estimation.gaussian import Array
-from common.estimation.polar import Bearing, Polar
-from common.estimation.sector import Sector
-from common.estimation.sensing import Measurement, Position, Sensor
+from waldnet.common.estimation import clutter_map
+from waldnet.common.estimation.clutter_map import ClutterMap, ClutterModel, learn, log_relative
+from waldnet.common.estimation.field_of_view import AllAround, Box, Disc, FieldOfView
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.estimation.polar import Bearing, Polar
+from waldnet.common.estimation.sector import Sector
+from waldnet.common.estimation.sensing import Measurement, Position, Sensor
 
 HERE = np.zeros(2)
 #: Five false plots in 100 cells of 100 m.

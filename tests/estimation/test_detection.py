@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.estimation.detection import (
+from waldnet.common.estimation.detection import (
     Constant,
     Detection,
     Notch,
@@ -19,9 +19,9 @@ from common.estimation.detection import (
     cumulative_rate,
     revisit_interval,
 )
-from common.estimation.field_of_view import Disc, Everywhere
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.sensing import Position, Sensor
+from waldnet.common.estimation.field_of_view import Disc, Everywhere
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.sensing import Position, Sensor
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

@@ -13,16 +13,16 @@ from hypothesis import strategies as st
 from scipy.special import logsumexp
 from scipy.stats import binom, multivariate_normal
 
-from common.estimation.association import Plots
-from common.estimation.detection import Constant, Detection, Notch
-from common.estimation.extraction import Candidates, Extractor, SensorScan, candidates, extract, seeds, together
-from common.estimation.field_of_view import Everywhere
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.mixture import EXACT, Reduction
-from common.estimation.motion import ConstantVelocity
-from common.estimation.polar import Polar
-from common.estimation.sensing import Position, Sensor
-from common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds, thresholds
+from waldnet.common.estimation.association import Plots
+from waldnet.common.estimation.detection import Constant, Detection, Notch
+from waldnet.common.estimation.extraction import Candidates, Extractor, SensorScan, candidates, extract, seeds, together
+from waldnet.common.estimation.field_of_view import Everywhere
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.mixture import EXACT, Reduction
+from waldnet.common.estimation.motion import ConstantVelocity
+from waldnet.common.estimation.polar import Polar
+from waldnet.common.estimation.sensing import Position, Sensor
+from waldnet.common.estimation.sprt import CONFIRMED, DELETED, TENTATIVE, Thresholds, thresholds
 
 MOTION = ConstantVelocity(2, 3.0)
 AREA = 4e4

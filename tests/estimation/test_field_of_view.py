@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 from scipy.stats import kstest, multivariate_normal, ncx2, norm
 
-from common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
-from common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
+from waldnet.common.estimation.gaussian import Array, Gaussian
 
 Field: TypeAlias = Everywhere | Box | Disc
 Draw: TypeAlias = Callable[..., Gaussian]

@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from common.estimation import association
-from common.estimation.association import Clutter, Plots, expect, update, within_reach
-from common.estimation.gating import inside_boxes
-from common.estimation.gaussian import Gaussian
-from common.estimation.polar import Polar
-from common.estimation.sensing import Position
+from waldnet.common.estimation import association
+from waldnet.common.estimation.association import Clutter, Plots, expect, update, within_reach
+from waldnet.common.estimation.gating import inside_boxes
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.polar import Polar
+from waldnet.common.estimation.sensing import Position
 
 SENSOR = Position((50.0, 20.0), 4)
 ORIGIN = np.zeros(2)

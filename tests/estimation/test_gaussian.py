@@ -16,7 +16,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 from scipy.stats import multivariate_normal
 
-from common.estimation.gaussian import (
+from waldnet.common.estimation.gaussian import (
     Array,
     Gaussian,
     half_log_det,

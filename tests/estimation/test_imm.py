@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.stats import multivariate_normal
 
-from common.estimation.association import Clutter, Plots, pdaf
-from common.estimation.gaussian import Array, Gaussian, moments
-from common.estimation.imm import (
+from waldnet.common.estimation.association import Clutter, Plots, pdaf
+from waldnet.common.estimation.gaussian import Array, Gaussian, moments
+from waldnet.common.estimation.imm import (
     FilteredModes,
     Imm,
     Modes,
@@ -28,8 +28,8 @@ from common.estimation.imm import (
     predict_modes,
     start,
 )
-from common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Kinematic, predict
-from common.estimation.sensing import Position
+from waldnet.common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Kinematic, predict
+from waldnet.common.estimation.sensing import Position
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

@@ -8,21 +8,29 @@ import numpy as np
 import pytest
 from scipy.stats import norm, qmc
 
-from common.estimation import association
-from common.estimation.association import Clutter, Plots, expect, innovations, update, weights_alone, within_reach
-from common.estimation.cluster import ClusterTest, cluster, extract_cluster
-from common.estimation.detection import Notch, Swerling
-from common.estimation.extraction import Extractor, SensorScan, candidates, extract
-from common.estimation.field_of_view import AllAround, Box, Disc, Everywhere, FieldOfView, View
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.imm import Modes, imm_pdaf
-from common.estimation.mixture import EXACT, Mixture, step, step_traced
-from common.estimation.motion import ConstantVelocity
-from common.estimation.notch import hypotheses
-from common.estimation.polar import Bearing, Polar, PolarDoppler
-from common.estimation.sector import Sector
-from common.estimation.sensing import Measurement, Position, Sensor
-from common.estimation.sprt import thresholds
+from waldnet.common.estimation import association
+from waldnet.common.estimation.association import (
+    Clutter,
+    Plots,
+    expect,
+    innovations,
+    update,
+    weights_alone,
+    within_reach,
+)
+from waldnet.common.estimation.cluster import ClusterTest, cluster, extract_cluster
+from waldnet.common.estimation.detection import Notch, Swerling
+from waldnet.common.estimation.extraction import Extractor, SensorScan, candidates, extract
+from waldnet.common.estimation.field_of_view import AllAround, Box, Disc, Everywhere, FieldOfView, View
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.imm import Modes, imm_pdaf
+from waldnet.common.estimation.mixture import EXACT, Mixture, step, step_traced
+from waldnet.common.estimation.motion import ConstantVelocity
+from waldnet.common.estimation.notch import hypotheses
+from waldnet.common.estimation.polar import Bearing, Polar, PolarDoppler
+from waldnet.common.estimation.sector import Sector
+from waldnet.common.estimation.sensing import Measurement, Position, Sensor
+from waldnet.common.estimation.sprt import thresholds
 
 P_D, LOG_RHO_F = 0.8, -9.0
 #: So far away that what is measured is a line in the state.

@@ -25,12 +25,12 @@ from stonesoup.types.state import GaussianState
 from stonesoup.types.track import Track
 from stonesoup.updater.kalman import KalmanUpdater
 
-from common.estimation import joint as joint_module
-from common.estimation.association import Clutter, Expected, Plots, expect, normalise, update, weights_alone
-from common.estimation.gaussian import Array, Gaussian, moments
-from common.estimation.joint import Claims, joint, log_free, unclaimed
-from common.estimation.mixture import EXACT, single, step
-from common.estimation.sensing import Position
+from waldnet.common.estimation import joint as joint_module
+from waldnet.common.estimation.association import Clutter, Expected, Plots, expect, normalise, update, weights_alone
+from waldnet.common.estimation.gaussian import Array, Gaussian, moments
+from waldnet.common.estimation.joint import Claims, joint, log_free, unclaimed
+from waldnet.common.estimation.mixture import EXACT, single, step
+from waldnet.common.estimation.sensing import Position
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

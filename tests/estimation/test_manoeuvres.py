@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from common.estimation.association import Clutter, Plots
-from common.estimation.gaussian import Array, BoolArray, Gaussian
-from common.estimation.imm import Imm, draw_path, imm_pdaf, predict_modes, start
-from common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Motion
-from common.estimation.sensing import Position
+from waldnet.common.estimation.association import Clutter, Plots
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian
+from waldnet.common.estimation.imm import Imm, draw_path, imm_pdaf, predict_modes, start
+from waldnet.common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Motion
+from waldnet.common.estimation.sensing import Position
 
 EASTWARD = np.array([0.0, 0.0, 50.0, 0.0])
 

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from reference import Density, History, Seer, aged, branched, mean_of, merged
 from scipy.special import logsumexp
 
-from common.estimation.association import Choice, Clutter, Expected, Plots, expect, nearest, normalise, update
-from common.estimation.gaussian import Array, Gaussian, moments
-from common.estimation.mixture import EXACT, Mixture, Reduction, reduced, single, step, terms
-from common.estimation.motion import ConstantVelocity
-from common.estimation.representation import Share
-from common.estimation.sensing import Position
+from waldnet.common.estimation.association import Choice, Clutter, Expected, Plots, expect, nearest, normalise, update
+from waldnet.common.estimation.gaussian import Array, Gaussian, moments
+from waldnet.common.estimation.mixture import EXACT, Mixture, Reduction, reduced, single, step, terms
+from waldnet.common.estimation.motion import ConstantVelocity
+from waldnet.common.estimation.representation import Share
+from waldnet.common.estimation.sensing import Position
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

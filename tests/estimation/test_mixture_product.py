@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from reference import Density, Term, folded, log_normal, multiplied
 from scipy.special import logsumexp
 
-from common.estimation.gaussian import Array, Gaussian, Product, Whitened, product, whitener
-from common.estimation.mixture_product import KEEP, multiply_mixtures
+from waldnet.common.estimation.gaussian import Array, Gaussian, Product, Whitened, product, whitener
+from waldnet.common.estimation.mixture_product import KEEP, multiply_mixtures
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

@@ -17,8 +17,8 @@ from scipy.linalg import expm
 from stonesoup.models.transition.linear import ConstantAcceleration as TheirConstantAcceleration
 from stonesoup.models.transition.linear import KnownTurnRate
 
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Kinematic, predict
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, Kinematic, predict
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

@@ -9,9 +9,9 @@ from typing import TypeAlias
 import numpy as np
 import pytest
 
-from common.estimation.gaussian import Gaussian
-from common.estimation.imm import Imm, predict_stationary
-from common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, predict
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.imm import Imm, predict_stationary
+from waldnet.common.estimation.motion import ConstantAcceleration, ConstantVelocity, CoordinatedTurn, predict
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.estimation.association import Clutter, Expected, Filtered, Plots, expect, kalman, nearest, update
-from common.estimation.detection import Notch
-from common.estimation.field_of_view import Everywhere
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.notch import Hypotheses, filtered, hypotheses
-from common.estimation.sensing import Position, Sensor
+from waldnet.common.estimation.association import Clutter, Expected, Filtered, Plots, expect, kalman, nearest, update
+from waldnet.common.estimation.detection import Notch
+from waldnet.common.estimation.field_of_view import Everywhere
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.notch import Hypotheses, filtered, hypotheses
+from waldnet.common.estimation.sensing import Position, Sensor
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

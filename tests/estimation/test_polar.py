@@ -26,13 +26,13 @@ from stonesoup.types.track import Track
 from stonesoup.updater.kalman import ExtendedKalmanUpdater
 from stonesoup.updater.probability import PDAUpdater
 
-from common.estimation.association import Clutter, Plots, pdaf
-from common.estimation.detection import Notch
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.polar import Bearing, Polar, PolarDoppler
-from common.estimation.sensing import Linearised, Measurement, Position
-from common.estimation.sight import to_cartesian, to_polar
-from common.estimation.sigma_points import SigmaPoint
+from waldnet.common.estimation.association import Clutter, Plots, pdaf
+from waldnet.common.estimation.detection import Notch
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.polar import Bearing, Polar, PolarDoppler
+from waldnet.common.estimation.sensing import Linearised, Measurement, Position
+from waldnet.common.estimation.sight import to_cartesian, to_polar
+from waldnet.common.estimation.sigma_points import SigmaPoint
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

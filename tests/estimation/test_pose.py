@@ -7,19 +7,19 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.estimation import clutter_map
-from common.estimation.association import Clutter, Plots, pdaf
-from common.estimation.clutter_map import ClutterModel
-from common.estimation.detection import Notch
-from common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.initiation import from_plots
-from common.estimation.polar import Bearing, Polar, PolarDoppler
-from common.estimation.pose import SensorPose
-from common.estimation.sector import Sector
-from common.estimation.sensing import Measurement, Position, Sensor
-from common.estimation.sight import radial_speed
-from common.estimation.sigma_points import SigmaPoint
+from waldnet.common.estimation import clutter_map
+from waldnet.common.estimation.association import Clutter, Plots, pdaf
+from waldnet.common.estimation.clutter_map import ClutterModel
+from waldnet.common.estimation.detection import Notch
+from waldnet.common.estimation.field_of_view import Box, Disc, Everywhere, FieldOfView
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.initiation import from_plots
+from waldnet.common.estimation.polar import Bearing, Polar, PolarDoppler
+from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.sector import Sector
+from waldnet.common.estimation.sensing import Measurement, Position, Sensor
+from waldnet.common.estimation.sight import radial_speed
+from waldnet.common.estimation.sigma_points import SigmaPoint
 
 SEEDS = st.integers(0, 2**32 - 1)
 #: Probability that a statistical test fails though the code is right; seeds are fixed, so it fails always or never.

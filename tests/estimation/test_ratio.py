@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from common.estimation import ratio
-from common.estimation.gaussian import Array, BoolArray, Gaussian, product
+from waldnet.common.estimation import ratio
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, product
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

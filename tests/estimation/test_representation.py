@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.motion import ConstantVelocity
-from common.estimation.representation import Share, globalise, shrink
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.motion import ConstantVelocity
+from waldnet.common.estimation.representation import Share, globalise, shrink
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

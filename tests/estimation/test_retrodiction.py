@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import logsumexp
 
-from common.estimation.association import Clutter, Plots, expect
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.mixture import EXACT, Mixture, Reduction, single, step, step_traced
-from common.estimation.motion import ConstantVelocity, predict
-from common.estimation.retrodiction import Generation, backward, descendants, generation, histories, smooth
-from common.estimation.sensing import Position
+from waldnet.common.estimation.association import Clutter, Plots, expect
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.mixture import EXACT, Mixture, Reduction, single, step, step_traced
+from waldnet.common.estimation.motion import ConstantVelocity, predict
+from waldnet.common.estimation.retrodiction import Generation, backward, descendants, generation, histories, smooth
+from waldnet.common.estimation.sensing import Position
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

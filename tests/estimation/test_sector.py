@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 from scipy.stats import kstest
 
-from common.estimation.field_of_view import AllAround, Disc
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.sector import Sector
+from waldnet.common.estimation.field_of_view import AllAround, Disc
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.sector import Sector
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

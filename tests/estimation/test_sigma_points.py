@@ -8,12 +8,12 @@ from typing import TypeAlias
 import numpy as np
 import pytest
 
-from common.estimation.association import Clutter, Plots, pdaf
-from common.estimation.gaussian import Array, Gaussian
-from common.estimation.polar import Bearing, Polar, PolarDoppler
-from common.estimation.quadrature import sigma_points
-from common.estimation.sensing import Linearised, Measurement, Position
-from common.estimation.sigma_points import SigmaPoint, circular_mean
+from waldnet.common.estimation.association import Clutter, Plots, pdaf
+from waldnet.common.estimation.gaussian import Array, Gaussian
+from waldnet.common.estimation.polar import Bearing, Polar, PolarDoppler
+from waldnet.common.estimation.quadrature import sigma_points
+from waldnet.common.estimation.sensing import Linearised, Measurement, Position
+from waldnet.common.estimation.sigma_points import SigmaPoint, circular_mean
 
 Draw: TypeAlias = Callable[..., Gaussian]
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import binomtest
 
-from common.estimation.gaussian import Array
-from common.estimation.sprt import Status, Thresholds, decide, thresholds
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.estimation.sprt import Status, Thresholds, decide, thresholds
 
 TENTATIVE, CONFIRMED, DELETED = Status.TENTATIVE, Status.CONFIRMED, Status.DELETED
 LIMITS = Thresholds(-3.0, 9.0)

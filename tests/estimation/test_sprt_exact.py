@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from exact_walk import leave, renewal_constant
 
-from common.estimation.gaussian import Array
-from common.estimation.sprt import Status, Thresholds, decide, thresholds
+from waldnet.common.estimation.gaussian import Array
+from waldnet.common.estimation.sprt import Status, Thresholds, decide, thresholds
 
 #: Shift d, alpha = beta; true alpha = true beta, and the mean length: by symmetry the same under both hypotheses.
 FIGURES = [

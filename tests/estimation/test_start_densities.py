@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from common.estimation.gaussian import Gaussian
-from common.estimation.initiation import apart, from_plots, with_second
-from common.estimation.motion import ConstantAcceleration, ConstantVelocity
-from common.estimation.polar import Polar, PolarDoppler
-from common.estimation.sensing import Measurement, Position
+from waldnet.common.estimation.gaussian import Gaussian
+from waldnet.common.estimation.initiation import apart, from_plots, with_second
+from waldnet.common.estimation.motion import ConstantAcceleration, ConstantVelocity
+from waldnet.common.estimation.polar import Polar, PolarDoppler
+from waldnet.common.estimation.sensing import Measurement, Position
 
 STAND = np.array([300.0, -200.0])
 SPREAD = np.array([15.0, 15.0])

@@ -1,1 +1,0 @@
-"""``waldnet evaluate``: how well recorded runs found the targets that truly were there."""

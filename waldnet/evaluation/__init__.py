@@ -1,0 +1,1 @@
+"""How well runs found their targets, and how often false tracks come."""

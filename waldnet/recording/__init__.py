@@ -1,0 +1,1 @@
+"""What runs leave behind: the run folder, JSON lines, inputs, figures."""

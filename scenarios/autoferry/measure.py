@@ -1,7 +1,8 @@
 """Measures the ferry's sensors against the truth of two boats.
 
 ``python -m waldnet.scenarios.autoferry.measure`` prints tables in Markdown from the files beside this module. A plot
-within 25 m of a boat is the boat's, a bearing within 0.1 rad is; a plot is at most one boat's, and all others are false.
+
+ithin 25 m of a boat is the boat's, a bearing within 0.1 rad is; a plot is at most one boat's, and all others are false.
 """
 
 from __future__ import annotations

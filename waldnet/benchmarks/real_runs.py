@@ -1,6 +1,6 @@
 """Real scenarios, tracked by waldnet and by a peer on the same plots, and judged by the truth: docs/real-runs.md.
 
-    python -m waldnet.benchmarks.real_runs SCENARIO          # track anew; prints a table, draws docs/images/SCENARIO.png
+    python -m waldnet.benchmarks.real_runs SCENARIO          # track anew: a table, and docs/images/SCENARIO.png
     python -m waldnet.benchmarks.real_runs SCENARIO --kept   # judge and draw again what was tracked last
     python -m waldnet.benchmarks.real_runs overview          # what was found last; tracks scenarios that were not yet
 

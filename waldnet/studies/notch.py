@@ -1,7 +1,7 @@
 """A figure of negative information: what a radar that sees nothing says about a velocity.
 
-``python -m waldnet.studies.notch docs/images/notch.png``: the density of a target's velocity before a scan, after a miss by
-one GMTI radar, after misses by two, and after a plot; exact, by a grid, with the filter's Gaussians over it.
+``python -m waldnet.studies.notch docs/images/notch.png``: the density of a target's velocity before a scan, after a
+miss by one GMTI radar, after misses by two, and after a plot; exact, by a grid, with the filter's Gaussians over it.
 """
 
 from __future__ import annotations

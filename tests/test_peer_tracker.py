@@ -224,7 +224,7 @@ def test_a_table_says_all_measures_and_a_dash_for_none() -> None:
     nothing = dict.fromkeys(("confirmed_after_s", "confirmed_after_radar_scans", "held_share", "rmse_m"))
     parts = dict.fromkeys(("total", "localisation", "missed", "false", "cardinality"), 1.0)
     counts = dict.fromkeys(("targets", "confirmed_targets", "breaks", "swaps", "confirmed_tracks"), 0)
-    tracks = {"false_tracks": 0, "duplicates": 0, "false_tracks_per_minute": 0.5, "cpu_s": 12.0}
+    tracks = {"false_tracks": 0, "duplicates": 0, "false_tracks_per_minute": 0.5, "near_no_target": 0.25, "cpu_s": 12.0}
     summary = {**nothing, **counts, **tracks, "gospa_m": parts, "ospa2_m": parts}
     head, _, *rows = table({"one": summary, "two": {**summary, "rmse_m": 3.25}})
     assert head == "| | one | two |"

@@ -16,7 +16,7 @@ import numpy as np
 from waldnet.common.config import Scenario
 from waldnet.common.estimation.batch import take
 from waldnet.common.estimation.gaussian import Gaussian
-from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.pose import Outlook
 from waldnet.common.estimation.sprt import DELETED
 from waldnet.common.fusion_config import FusionConfig
 from waldnet.common.messages import (
@@ -71,7 +71,6 @@ class Center:
         hypotheses: the tracks given by the scenario, as a picture.
         life: tests the tracks, and ends those that nobody sees.
         initiation: how further tracks start; None: they do not.
-        poses: of the sensors at first.
         epoch_ns: the instant of scenario time 0.
         speed: seconds of measurement time per second, 0: lockstep.
         wait_ns: how long to wait for the others, once a sensor has joined, before the clock starts.
@@ -85,7 +84,6 @@ class Center:
     hypotheses: Picture
     life: Life
     initiation: Initiation | None
-    poses: tuple[SensorPose, ...]
     epoch_ns: int
     speed: float
     wait_ns: int
@@ -103,7 +101,6 @@ class Center:
             hypotheses=given(scenario, fuser),
             life=Life.of(scenario),
             initiation=Initiation.of(scenario),
-            poses=tuple(sensor.pose(scenario.motion.dimensions) for sensor in scenario.sensors),
             epoch_ns=scenario.epoch_ns,
             speed=speed,
             wait_ns=round(wait_s * NS_PER_S),
@@ -123,7 +120,7 @@ class Center:
             history=(),
             counts=Counts(),
             next_id=len(self.hypotheses.ids),
-            base_poses=self.poses,
+            base_outlooks=self.life.begin(),
         )
 
     def step(self, state: State, event: Event, now_ns: int) -> tuple[State, list[Message]]:
@@ -342,8 +339,8 @@ class Center:
             expected = self.fuser.expect(self.fuser.rebased(state.picture, then, rebase), time_ns)
         # A node that has not followed yet speaks of factors that are no more.
         heard = {number: heard for number, heard in reports.items() if heard.lineage == lineage}
-        poses = self._poses(state, reports)
-        picture, decisions = self.life.judge(self.fuser.advance(expected, heard), time_ns, poses)
+        outlooks = self._outlooks(state, time_ns, reports)
+        picture, decisions = self.life.judge(self.fuser.advance(expected, heard), time_ns, outlooks)
         pairs = state.pairs
         if self.initiation is not None:
             picture, pairs, merged = self.initiation.merged(state.picture, picture, pairs)
@@ -351,14 +348,13 @@ class Center:
             begun = begun or self._seeds(state, self.initiation, picture, reports)
             picture = self.fuser.begin(picture, begun.ids, np.full(len(begun.ids), time_ns), begun.density)
             state = state._replace(next_id=max([state.next_id, *(begun.ids + 1).tolist()]))
-        checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), begun, lineage, poses, pairs)
+        checkpoint = Checkpoint(time_ns, reports, picture, tuple(decisions), begun, lineage, outlooks, pairs)
         return state._replace(history=(*state.history, checkpoint))
 
-    @staticmethod
-    def _poses(state: State, reports: Mapping[int, AnyHeard]) -> tuple[SensorPose, ...]:
-        """Of each sensor at its last scan."""
+    def _outlooks(self, state: State, time_ns: int, reports: Mapping[int, AnyHeard]) -> tuple[Outlook, ...]:
+        """Of the sensors after the reports of a measurement time."""
         told = {number: heard.report.pose for number, heard in reports.items() if len(heard.report.position)}
-        return tuple(told.get(number, pose) for number, pose in enumerate(state.poses))
+        return self.life.look(state.outlooks, told, time_ns - state.time_ns)
 
     def _seeds(self, state: State, initiation: Initiation, picture: Picture, reports: Mapping[int, AnyHeard]) -> Begun:
         """The tracks that begin at the measurement time of a picture (theory.md §8)."""
@@ -459,7 +455,7 @@ class Center:
             base=base.picture,
             base_ns=base.time_ns,
             base_lineage=base.lineage,
-            base_poses=base.poses,
+            base_outlooks=base.outlooks,
             base_pairs=base.pairs,
             told=told,
         )

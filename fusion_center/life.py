@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from waldnet.common.config import Scenario, SensorConfig
+from waldnet.common.estimation.field_of_view import FieldOfView
 from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian
 from waldnet.common.estimation.motion import Motion
-from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.pose import Outlook, SensorPose
 from waldnet.common.estimation.sensing import Sensor
 from waldnet.common.estimation.sprt import CONFIRMED, DELETED, Existence, Thresholds, decide, decide_with_life
 from waldnet.common.life_config import LifeConfig
@@ -37,22 +38,22 @@ class View(NamedTuple):
     Attributes:
         config: the sensor as the scenario describes it.
         sensor: its model.
-        interval_s: between two of its scans [s].
-        patience_s: it may well miss a target that is there for so long [s].
+        scans: it may well miss a target that is there in so many scans,
+        hidden_s: or for so long [s].
     """
 
     config: SensorConfig
     sensor: Sensor
-    interval_s: float
-    patience_s: float
+    scans: float
+    hidden_s: float
 
     @classmethod
     def of(cls, config: SensorConfig, motion: Motion) -> View:
         """The view of a sensor of a scenario."""
-        interval_s, p_d = max(config.scan_interval, config.spacing), config.p_d or _SOME_P_D
+        p_d = config.p_d or _SOME_P_D
         scans = _FEW_SCANS if p_d == 1.0 else max(np.ceil(np.log(_CHANCE) / np.log1p(-p_d)), _FEW_SCANS)
         hidden_s = 0.0 if config.visibility is None else config.visibility.hidden_for
-        return cls(config, config.build(motion), interval_s, max(float(scans) * interval_s, hidden_s))
+        return cls(config, config.build(motion), float(scans), hidden_s)
 
 
 class Ending(NamedTuple):
@@ -61,13 +62,13 @@ class Ending(NamedTuple):
     Attributes:
         coasting_s: without a plot for so long, a confirmed track is coasting [s]; None: for longer than any sensor
             that should see it may well miss it.
-        lost_s: without a plot for so long, a track may be lost [s].
+        lost_s: without a plot for so long, a track may be lost [s]; None: for a few scans of the slowest sensor.
         lost_below: it is, if it lies in any field of view with less than this probability,
         lost_sigma: or if the standard deviation of its position is larger than this [m].
     """
 
     coasting_s: float | None
-    lost_s: float
+    lost_s: float | None
     lost_below: float
     lost_sigma: float
 
@@ -81,12 +82,14 @@ class Life:
         ending: None: tracks that nobody sees stay.
         views: of the sensors.
         dimensions: of space.
+        memory_s: sensors that turn may look again where they have looked in so long [s].
     """
 
     limits: Thresholds | None
     ending: Ending | None
     views: tuple[View, ...]
     dimensions: int
+    memory_s: float
 
     @classmethod
     def of(cls, scenario: Scenario) -> Life:
@@ -94,15 +97,30 @@ class Life:
         motion = scenario.motion.build()
         views = tuple(View.of(sensor, motion) for sensor in scenario.sensors)
         limits = scenario.decision.thresholds if scenario.decision.enabled else None
-        return cls(limits, _ending(scenario.life, views, scenario.extent), views, motion.dimensions)
+        return cls(limits, _ending(scenario.life, scenario.extent), views, motion.dimensions, scenario.stay)
 
-    def judge(self, picture: Picture, time_ns: int, poses: Sequence[SensorPose]) -> tuple[Picture, list[Decision]]:
+    def begin(self) -> tuple[Outlook, ...]:
+        """Where the sensors look before their first scan."""
+        configs = [view.config for view in self.views]
+        return tuple(
+            Outlook(config.pose(self.dimensions), max(config.scan_interval, config.spacing)) for config in configs
+        )
+
+    def look(
+        self, outlooks: Sequence[Outlook], poses: Mapping[int, SensorPose], elapsed_ns: int
+    ) -> tuple[Outlook, ...]:
+        """Where the sensors look after a time, at which those with ``poses``, by number, have scanned."""
+        return tuple(
+            outlook.after(poses.get(number), elapsed_ns, self.memory_s) for number, outlook in enumerate(outlooks)
+        )
+
+    def judge(self, picture: Picture, time_ns: int, outlooks: Sequence[Outlook]) -> tuple[Picture, list[Decision]]:
         """Test all tracks, and end those that nobody sees.
 
         Args:
             picture: with all reports of a measurement time.
             time_ns: that time.
-            poses: of each sensor at its last scan.
+            outlooks: of the sensors.
 
         Returns:
             the picture after the test, and what was decided.
@@ -124,56 +142,71 @@ class Life:
             for row in np.nonzero(verdict.status != picture.status)[0].tolist()
         ]
         picture = picture._replace(log_lr=existence.log_lr, log_left=existence.log_left, status=verdict.status)
-        return self._end_unseen(picture, self.ending, time_ns, poses, decisions)
+        return self._end_unseen(picture, self.ending, time_ns, outlooks, decisions)
 
     def _end_unseen(
-        self, picture: Picture, ending: Ending, time_ns: int, poses: Sequence[SensorPose], decisions: list[Decision]
+        self, picture: Picture, ending: Ending, time_ns: int, outlooks: Sequence[Outlook], decisions: list[Decision]
     ) -> tuple[Picture, list[Decision]]:
         """The picture without tracks that nobody sees, and with those coasting that should have been seen."""
         unseen_s = (time_ns - picture.supported_ns) / NS_PER_S
-        shortest = min([ending.lost_s, *(view.patience_s for view in self.views)])
-        if ending.coasting_s is not None:
-            shortest = min(shortest, ending.coasting_s)
+        views, looks_s = self._swept(outlooks)
+        lost_s = _LOST_SCANS * float(looks_s.max()) if ending.lost_s is None else ending.lost_s
+        patience_s = self._patience_s(ending, looks_s)
+        shortest = min(lost_s, *patience_s)
         rows = np.flatnonzero((unseen_s >= shortest) & (picture.status != DELETED))
         coasting, status = np.zeros(len(picture.ids), np.bool_), picture.status.copy()
         if len(rows):
             unseen_s, d = unseen_s[rows], self.dimensions
             position = Gaussian(picture.fused_x[rows, :d], picture.fused_P[rows, :d, :d])
-            inside = self._inside(position, poses)
-            coasting[rows] = (status[rows] == CONFIRMED) & (unseen_s >= self._coasting_s(ending, inside))
+            inside = self._inside(position, views, outlooks)
+            coasting[rows] = (status[rows] == CONFIRMED) & (unseen_s >= _longest(patience_s, inside))
             unknown = np.linalg.eigvalsh(position.P)[:, -1] > ending.lost_sigma**2
             nowhere = 1.0 - np.prod(1.0 - inside, axis=-1) < ending.lost_below
-            lost = rows[(unseen_s >= ending.lost_s) & (unknown | nowhere)]
+            lost = rows[(unseen_s >= lost_s) & (unknown | nowhere)]
             status[lost] = DELETED
             decisions = [*decisions, *(decision_of("lost", picture, row) for row in lost.tolist())]
         return picture._replace(status=status, coasting=coasting & (status == CONFIRMED)), decisions
 
-    def _inside(self, position: Gaussian, poses: Sequence[SensorPose]) -> Array:
+    def _swept(self, outlooks: Sequence[Outlook]) -> tuple[list[FieldOfView], Array]:
+        """What the sensors look at as they turn, and the mean time between two looks at a place [s], shape (S,)."""
+        swept, looks_s = list[FieldOfView](), list[float]()
+        for view, outlook in zip(self.views, outlooks, strict=True):
+            now = view.sensor.at(outlook.pose).field_of_view
+            whole = now if view.sensor.fixed_view else now.swept(outlook.left, outlook.right)
+            swept.append(whole)
+            looks_s.append(outlook.interval_s * (1.0 if whole == now else whole.volume / now.volume))
+        return swept, np.array(looks_s)
+
+    def _inside(self, position: Gaussian, views: Sequence[FieldOfView], outlooks: Sequence[Outlook]) -> Array:
         """Probability of positions to lie in each sensor's field of view, shapes (R, d), (R, d, d) to (R, S)."""
         inside = (
-            view.sensor.at(pose).field_of_view.probability_inside(position, view.config.view_center(pose.position))
-            for view, pose in zip(self.views, poses, strict=True)
+            field.probability_inside(position, view.config.view_center(outlook.pose.position))
+            for field, view, outlook in zip(views, self.views, outlooks, strict=True)
         )
         return np.stack(list(inside), axis=-1)
 
-    def _coasting_s(self, ending: Ending, inside: Array) -> Array:
-        """After how long without a plot a confirmed track is coasting, shape (R, S) to (R,) [s]."""
+    def _patience_s(self, ending: Ending, looks_s: Array) -> Array:
+        """After how long without a plot a track that a sensor should see is coasting, shape (S,) [s]."""
         if ending.coasting_s is not None:
-            return np.full(len(inside), ending.coasting_s)
-        should: BoolArray = inside >= _IN_VIEW
-        should |= ~should.any(axis=-1, keepdims=True)
-        patience_s = np.array([view.patience_s for view in self.views])
-        return np.asarray(np.where(should, patience_s, 0.0).max(axis=-1))
+            return np.full(len(self.views), ending.coasting_s)
+        patience_s = looks_s * [view.scans for view in self.views]
+        return np.maximum(patience_s, [view.hidden_s for view in self.views])
 
 
-def _ending(config: LifeConfig | None, views: Sequence[View], extent: float) -> Ending | None:
+def _longest(patience_s: Array, inside: Array) -> Array:
+    """The patience of the slowest sensor that should see a track, shapes (S,), (R, S) to (R,) [s]."""
+    should: BoolArray = inside >= _IN_VIEW
+    should |= ~should.any(axis=-1, keepdims=True)
+    return np.asarray(np.where(should, patience_s, 0.0).max(axis=-1))
+
+
+def _ending(config: LifeConfig | None, extent: float) -> Ending | None:
     """How tracks end; None where they have no life."""
     if config is None:
         return None
-    slowest = max(view.interval_s for view in views)
     return Ending(
         coasting_s=config.coasting_after,
-        lost_s=_LOST_SCANS * slowest if config.lost_after is None else config.lost_after,
+        lost_s=config.lost_after,
         lost_below=config.lost_below,
         lost_sigma=_LOST_SHARE * extent if config.lost_sigma is None else config.lost_sigma,
     )

@@ -7,7 +7,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from waldnet.common.estimation.gaussian import Gaussian
-from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.pose import Outlook
 from waldnet.common.messages import NEVER, Clock, Decision, IntArray, Join, Picked, Rebase, Report
 from waldnet.fusion_center.factors import Expected, Heard
 from waldnet.fusion_center.initiation import Pairs
@@ -108,7 +108,7 @@ class Checkpoint(NamedTuple):
         decisions: made then.
         begun: tracks that began then; None: none ever do.
         lineage: epoch of the rebase that the factors of the picture descend from; 0: none.
-        poses: of each sensor at its last scan.
+        outlooks: of the sensors.
         pairs: log LR of two targets against one, of confirmed tracks that are close to each other, by their ids.
     """
 
@@ -118,7 +118,7 @@ class Checkpoint(NamedTuple):
     decisions: tuple[Decision, ...]
     begun: Begun | None = None
     lineage: int = 0
-    poses: tuple[SensorPose, ...] = ()
+    outlooks: tuple[Outlook, ...] = ()
     pairs: Pairs = MappingProxyType({})
 
 
@@ -178,7 +178,7 @@ class State(NamedTuple):
         base: the picture before the oldest checkpoint.
         base_ns: its time.
         base_lineage: its lineage.
-        base_poses: its poses.
+        base_outlooks: its outlooks.
         base_pairs: its pairs.
         history: checkpoints inside the window, oldest first.
         counts: of reports.
@@ -198,7 +198,7 @@ class State(NamedTuple):
     counts: Counts
     refused: Refused = MappingProxyType({})
     base_lineage: int = 0
-    base_poses: tuple[SensorPose, ...] = ()
+    base_outlooks: tuple[Outlook, ...] = ()
     base_pairs: Pairs = MappingProxyType({})
     told: tuple[Told, ...] = ()
     next_id: int = 0
@@ -215,9 +215,9 @@ class State(NamedTuple):
         return self.history[-1].lineage if self.history else self.base_lineage
 
     @property
-    def poses(self) -> tuple[SensorPose, ...]:
-        """Of each sensor at its last scan."""
-        return self.history[-1].poses if self.history else self.base_poses
+    def outlooks(self) -> tuple[Outlook, ...]:
+        """Of the sensors."""
+        return self.history[-1].outlooks if self.history else self.base_outlooks
 
     @property
     def pairs(self) -> Pairs:

@@ -111,8 +111,8 @@ def tracks_at(plot: Scenario, places: list[list[float]], sigma: float = 5.0, **f
 
 def judged(plot: Scenario, picture: Picture, after_s: float, pose: list[float] | None = None) -> dict[int, str]:
     """What becomes of tracks without a plot for some time: lost, coasting, or confirmed."""
-    poses = [SensorPose(np.array(pose or [0.0, 0.0])) for _ in plot.sensors]
-    after, decisions = Life.of(plot).judge(picture, round(after_s * 1e9), poses)
+    outlooks = [look._replace(pose=SensorPose(np.array(pose or [0.0, 0.0]))) for look in Life.of(plot).begin()]
+    after, decisions = Life.of(plot).judge(picture, round(after_s * 1e9), outlooks)
     found = dict.fromkeys(after.ids.tolist(), "confirmed") | dict.fromkeys(
         after.ids[after.coasting].tolist(), "coasting"
     )
@@ -181,11 +181,23 @@ def test_the_slowest_sensor_that_should_see_it_counts() -> None:
     fast = sensor_table("fast", position=[0.0, 0.0], scan_interval=0.5, field_of_view=small)
     slow = sensor_table("slow", position=[1000.0, 0.0], scan_interval=4.0, field_of_view=small)
     plot = watched(fast, slow, life={"lost_after": 1000.0})
-    poses = [SensorPose(np.array([x, 0.0])) for x in (0.0, 1000.0)]
+    outlooks = Life.of(plot).begin()
     picture = tracks_at(plot, [[0.0, 0.0], [1000.0, 0.0]])
     for after_s, coasting in ((1.0, [False, False]), (2.0, [True, False]), (12.0, [True, True])):
-        after, _ = Life.of(plot).judge(picture, round(after_s * 1e9), poses)
+        after, _ = Life.of(plot).judge(picture, round(after_s * 1e9), outlooks)
         assert after.coasting.tolist() == coasting
+
+
+@pytest.mark.parametrize("claimed_s", [0.2, 20.0])
+def test_how_often_a_sensor_scans_is_seen_from_its_scans(claimed_s: float) -> None:
+    plot = watched(sensor_table("a", position=[0.0, 0.0], scan_interval=claimed_s), life={"lost_after": 1000.0})
+    life, picture = Life.of(plot), tracks_at(plot, [[0.0, 0.0]])
+    outlooks = life.begin()
+    for _ in range(40):
+        outlooks = life.look(outlooks, {0: outlooks[0].pose}, 2 * 10**9)
+    for after_s, coasting in ((5.5, False), (6.5, True)):  # three scans of 2 s
+        after, _ = life.judge(picture, round(after_s * 1e9), outlooks)
+        assert after.coasting.tolist() == [coasting]
 
 
 def test_given_hypotheses_live_as_before_unless_the_scenario_says_otherwise() -> None:
@@ -255,6 +267,38 @@ def test_a_target_that_leaves_the_view_is_lost_soon_in_every_mode(way: str) -> N
         int(tracks.status[place]) for tracks in pictures for place in np.flatnonzero(tracks.ids == lost[0].track)
     }
     assert statuses == set(Status)
+
+
+def turning(plot: Scenario, path: Any, until_s: float, seed: int = 2) -> list[Scan]:
+    """Every half second a sector looks an eighth of a circle on."""
+    rng, scans = np.random.default_rng(seed), []
+    for number in range(1, int(2.0 * until_s)):
+        time_s, heading = 0.5 * number, (0.25 * np.pi * number) % (2.0 * np.pi)
+        place = np.array(path(time_s))
+        off = (np.arctan2(*place) - heading + np.pi) % (2.0 * np.pi) - np.pi
+        seen = abs(off) < 0.5 and rng.random() < 0.9
+        z = [place + 5.0 * rng.normal(size=2)] if seen else []
+        scans.append(Scan("a", plot.to_ns(time_s), np.zeros(2), np.array(z).reshape(-1, 2), heading=float(heading)))
+    return scans
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_target_between_two_looks_of_a_sector_that_turns_is_not_lost(way: str) -> None:
+    view = {"shape": "sector", "radius": 500.0, "direction": 0.0, "width": 1.0}
+    table = {"position": [0.0, 0.0], "sigma": [5.0, 5.0], "false_plots": 0.1, "scan_interval": 0.5}
+    plot = watched(sensor_table("a", field_of_view=view, **table), fusion=WAYS[way])
+    scans = turning(plot, lambda t: (5.0 * t - 200.0, 150.0), 80.0)
+    pictures, decisions = said(plot, scans, way)
+    assert [decision.kind for decision in decisions].count("confirmed") == 1
+    assert not {"lost", "merged"} & {decision.kind for decision in decisions}
+    shown = [tracks.status for tracks in pictures if np.isin(tracks.status, [Status.CONFIRMED, Status.COASTING]).any()]
+    coasting = [bool((status == Status.COASTING).any()) for status in shown]
+    assert len(coasting) > 80
+    assert np.mean(coasting) < 0.2  # a turn takes 4 s; two looks in a row are seldom missed
+    gone = turning(plot, lambda t: (5.0 * t - 200.0, 150.0) if t < 60.0 else (0.0, 900.0), 140.0)
+    gone = [scan if len(scan.z) == 0 or abs(scan.z[0, 1]) < 500.0 else scan._replace(z=scan.z[:0]) for scan in gone]
+    pictures, _ = said(plot, gone, way)
+    assert not np.isin(pictures[-1].status, [Status.CONFIRMED, Status.COASTING]).any()
 
 
 @pytest.mark.parametrize("way", ["advice", "selected", "centralised"])

@@ -42,6 +42,10 @@ class FieldOfView(Protocol):
         """The field of view of a platform with this heading [rad], clockwise from north, of one that headed north."""
         ...
 
+    def swept(self, left: float, right: float) -> FieldOfView:
+        """What it passes over, or more, as its platform turns so far to the left and to the right [rad], both >= 0."""
+        ...
+
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included.
 
@@ -117,6 +121,10 @@ class Everywhere(NamedTuple):
         """The same: it has no direction."""
         return self
 
+    def swept(self, left: float, right: float) -> Everywhere:  # noqa: ARG002 (the same all around)
+        """The same."""
+        return self
+
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside: always, shapes (..., d) to (...)."""
         return np.ones(np.broadcast_shapes(z.shape, center.shape)[:-1], dtype=np.bool_)
@@ -149,6 +157,10 @@ class AllAround(NamedTuple):
 
     def turned(self, heading: float) -> AllAround:  # noqa: ARG002
         """The same: it has no direction."""
+        return self
+
+    def swept(self, left: float, right: float) -> AllAround:  # noqa: ARG002 (the same all around)
+        """The same."""
         return self
 
     def contains(self, z: Array, center: Array) -> BoolArray:
@@ -184,6 +196,10 @@ class Box(NamedTuple):
     def turned(self, heading: float) -> Box:
         """The box turned further around its center."""
         return self._replace(heading=self.heading + heading)
+
+    def swept(self, left: float, right: float) -> Box | Disc:
+        """The disc or ball around it, once it turns."""
+        return Disc(0.5 * float(np.linalg.vector_norm(self.size)), len(self.size)) if left or right else self
 
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included, shapes (..., d) to (...)."""
@@ -242,6 +258,10 @@ class Disc(NamedTuple):
 
     def turned(self, heading: float) -> Disc:  # noqa: ARG002
         """The same: it is round."""
+        return self
+
+    def swept(self, left: float, right: float) -> Disc:  # noqa: ARG002 (the same all around)
+        """The same."""
         return self
 
     def contains(self, z: Array, center: Array) -> BoolArray:

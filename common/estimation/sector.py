@@ -63,6 +63,11 @@ class Sector(NamedTuple):
         """The sector with its middle turned by the heading of its platform [rad], clockwise."""
         return self._replace(direction=self.direction + heading)
 
+    def swept(self, left: float, right: float) -> Sector:
+        """The sector that it passes over: as much wider as it turns."""
+        width = min(self.width + left + right, 2.0 * np.pi)
+        return self._replace(direction=self.direction + 0.5 * (right - left), width=width)
+
     def contains(self, z: Array, center: Array) -> BoolArray:
         """Whether points lie inside, the edge included, shapes (..., d) to (...)."""
         offset = z - center

@@ -15,7 +15,7 @@ from waldnet.common.estimation.field_of_view import Box, Disc, Everywhere, Field
 from waldnet.common.estimation.gaussian import Array, Gaussian
 from waldnet.common.estimation.initiation import from_plots
 from waldnet.common.estimation.polar import Bearing, Polar, PolarDoppler
-from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.pose import Outlook, SensorPose
 from waldnet.common.estimation.sector import Sector
 from waldnet.common.estimation.sensing import Measurement, Position, Sensor
 from waldnet.common.estimation.sight import radial_speed
@@ -192,6 +192,46 @@ def test_a_field_of_view_turns_with_its_sensor(view: FieldOfView, seed: int, hea
     np.testing.assert_allclose(p, view.probability_inside(Gaussian(points, P), np.zeros(d)), atol=2e-8)
     assert there.volume == view.volume
     assert there.contains(there.draw(rng, 50, center), center).all()
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=str)
+@settings(deadline=None, derandomize=True, database=None, max_examples=20)
+@given(SEEDS, st.floats(0.0, 4.0), st.floats(0.0, 4.0))
+def test_what_is_swept_holds_the_view_at_every_heading_on_the_way(
+    view: FieldOfView, seed: int, left: float, right: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    d = 3 if view in (VIEWS[1], VIEWS[3], VIEWS[5]) else 2
+    swept, center = view.swept(left, right), np.zeros(d)
+    for heading in (-left, right, rng.uniform(-left, right)):
+        assert swept.contains((1.0 - 1e-9) * view.turned(heading).draw(rng, 40, center), center).all()
+    assert view.swept(0.0, 0.0) == view
+    assert swept.volume >= view.volume
+
+
+def test_an_outlook_knows_how_far_its_platform_has_turned_and_forgets_it() -> None:
+    def headed(headings: Array, memory_s: float) -> Outlook:
+        outlook = Outlook(SensorPose(np.zeros(2)), 1.0)
+        for heading in headings:
+            outlook = outlook.after(SensorPose(np.zeros(2), heading=float(heading)), 10**9, memory_s)
+        return outlook
+
+    round_and_round = headed(np.arange(3.0, 63.0, 0.5) % 6.28, 100.0)
+    assert round_and_round.left + round_and_round.right >= 2.0 * np.pi
+    to_and_fro = headed(0.5 * np.sin(np.arange(60.0)), np.inf)
+    np.testing.assert_allclose((to_and_fro.left + to_and_fro.right), 1.0, atol=0.01)
+    np.testing.assert_allclose(to_and_fro.left, 0.5 + 0.5 * np.sin(59.0), atol=0.01)
+    once = headed(np.array([3.1, -3.1, *np.full(30, -3.1)]), 5.0)  # 0.083 to the right, across south
+    assert once.left < 1e-3
+    assert headed(np.array([3.1, -3.1]), np.inf).left == pytest.approx(2.0 * np.pi - 6.2)
+    assert headed(np.array([2.0]), np.inf).left == 0.0  # where it heads at first is no turn
+
+
+def test_an_outlook_learns_how_often_its_sensor_scans() -> None:
+    outlook = Outlook(SensorPose(np.zeros(2)), 0.2)
+    for second in range(1, 60):
+        outlook = outlook.after(SensorPose(np.zeros(2)) if second % 2 else None, 10**9, np.inf)
+    assert outlook.interval_s == pytest.approx(2.0, rel=0.01)
 
 
 def test_what_does_not_turn_and_what_stands_still() -> None:

@@ -95,7 +95,7 @@ def center_scan(tracks: int) -> Callable[[], object]:
     ids, now = np.arange(tracks), np.zeros(tracks, np.int64)
     sensor = Sensor(SENSOR, P_D, 5.0, Everywhere(5.0 / RHO_F, 2))
     fuser = Fuser(MOTION, (sensor,) * SENSORS, Share(SENSORS), 1, np.inf, globalised=False)
-    life = Life(thresholds(1e-4, 0.95), None, (), 2)
+    life = Life(thresholds(1e-4, 0.95), None, (), 2, np.inf)
     picture = fuser.begin(fuser.empty(), ids, now, prior)
     x, P, log_g = prior.x + 10.0, 0.5 * SENSORS * prior.P, np.ones(tracks)
     later = round(DT * NS_PER_S)

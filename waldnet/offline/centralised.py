@@ -16,7 +16,7 @@ import numpy as np
 from waldnet.common.config import Scenario
 from waldnet.common.estimation.batch import take
 from waldnet.common.estimation.imm import Imm
-from waldnet.common.estimation.pose import SensorPose
+from waldnet.common.estimation.pose import Outlook
 from waldnet.common.estimation.sprt import DELETED
 from waldnet.common.local_filter import HONEST, LocalFilter
 from waldnet.common.messages import NEVER, Decision, Report, Scan, Start, Stop, Tracks
@@ -39,7 +39,8 @@ class State(NamedTuple):
         picture: all tracks, with those to come and those just deleted.
         unclaimed: plots of the last seconds that no track claims, oldest first.
         next_id: of the next track that begins.
-        poses: of each sensor at its last scan.
+        outlooks: of the sensors.
+        time_ns: of the picture.
         pairs: of confirmed tracks that are close to each other.
     """
 
@@ -47,7 +48,8 @@ class State(NamedTuple):
     picture: Picture
     unclaimed: tuple[Unclaimed, ...]
     next_id: int
-    poses: tuple[SensorPose, ...]
+    outlooks: tuple[Outlook, ...]
+    time_ns: int
     pairs: Pairs
 
 
@@ -62,7 +64,6 @@ class Centralised:
         hypotheses: the tracks given by the scenario.
         life: tests the tracks, and ends those that nobody sees.
         initiation: how further tracks start; None: they do not.
-        poses: of the sensors at first.
     """
 
     names: tuple[str, ...]
@@ -71,7 +72,6 @@ class Centralised:
     hypotheses: Picture
     life: Life
     initiation: Initiation | None
-    poses: tuple[SensorPose, ...]
 
     @classmethod
     def of(cls, scenario: Scenario) -> Centralised:
@@ -88,13 +88,13 @@ class Centralised:
             hypotheses=given(scenario, fuser),
             life=Life.of(scenario),
             initiation=Initiation.of(scenario),
-            poses=tuple(sensor.pose(scenario.motion.dimensions) for sensor in scenario.sensors),
         )
 
     def initial(self) -> State:
         """Before the first scan."""
         none: Pairs = {}
-        return State(self.tracker.initial(), self.hypotheses, (), len(self.hypotheses.ids), self.poses, none)
+        next_id, outlooks = len(self.hypotheses.ids), self.life.begin()
+        return State(self.tracker.initial(), self.hypotheses, (), next_id, outlooks, -NEVER, none)
 
     def step(self, state: State, scans: Sequence[Scan]) -> tuple[State, list[Tracks | Decision]]:
         """Work in all scans of one measurement time, one after the other.
@@ -118,10 +118,10 @@ class Centralised:
         heard = self.fuser.heard(whole)
         assert isinstance(heard, Heard), "it is a report of this scenario"
         moved = self.fuser.advance(expected, {0: heard})
-        told = {scan.sensor: scan.pose for scan in scans}
-        poses = tuple(told.get(name, pose) for name, pose in zip(self.names, state.poses, strict=True))
-        picture, decisions = self.life.judge(moved, time_ns, poses)
-        state = state._replace(filtered=filtered, picture=picture, poses=poses)
+        told = {self.names.index(scan.sensor): scan.pose for scan in scans}
+        outlooks = self.life.look(state.outlooks, told, time_ns - state.time_ns)
+        picture, decisions = self.life.judge(moved, time_ns, outlooks)
+        state = state._replace(filtered=filtered, picture=picture, outlooks=outlooks, time_ns=time_ns)
         if self.initiation is not None:
             now = [Unclaimed.of(self.names.index(report.sensor), report) for report in reports]
             state, merged = self._initiated(before, state, self.initiation, now)

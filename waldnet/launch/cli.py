@@ -14,7 +14,6 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from waldnet.benchmarks.cli import bench
 from waldnet.common.config import Network, Scenario, load_scenario
 from waldnet.common.errors import ConfigError
 from waldnet.common.estimation.sprt import Status
@@ -23,24 +22,25 @@ from waldnet.common.logs import LogFormat, configure
 from waldnet.common.messages import Tracks
 from waldnet.common.process import HealthSocket, NetworkOptions, Seconds, Seed, Speed, Verbose
 from waldnet.common.process import main as run_app
-from waldnet.evaluation.cli import evaluate
-from waldnet.fusion_center.app import center
-from waldnet.launch.measuring import measure
 from waldnet.scenarios.catalogue import find, names
-from waldnet.sensor_node.app import node
-from waldnet.studies.cli import study
+
+#: Commands that are imported when they are called: module and function, and what the help says.
+_ELSEWHERE = {
+    "waldnet.benchmarks.cli:bench": "Measure a network on this machine: latency, bandwidth, precision, tracks, load.",
+    "waldnet.evaluation.cli:evaluate": "Tell how well a recorded run found its targets.",
+    "waldnet.fusion_center.app:center": "Run the fusion center: order reports, compute the likelihood ratio, decide.",
+    "waldnet.launch.measuring:measure": "Measure what the sensors of a recording are like.",
+    "waldnet.sensor_node.app:node": "Run one sensor: filter its scans and report to the fusion center.",
+    "waldnet.studies.cli:study": "Monte Carlo: modes of fusion side by side on the same plots.",
+}
 
 app = App(
     name="waldnet",
     version=version("waldnet"),
     help="Sensors decide together, by Wald's sequential test, which tracks are real.",
 )
-app.command(node)
-app.command(center)
-app.command(study)
-app.command(evaluate)
-app.command(bench)
-app.command(measure)
+for _path, _help in _ELSEWHERE.items():
+    app.command(_path, help=_help)
 
 
 @app.command

@@ -15,7 +15,7 @@ class LifeConfig(Model):
             sensors that should see it, as many scans as it misses in a row once in a thousand times (three at p_d =
             0.9), or its ``visibility.hidden_for`` if that is longer.
         lost_after: without a plot for so long, a track is lost as soon as no sensor can see it or its position is not
-            known [s]; default: five scans of the slowest sensor.
+            known [s]; default: five scans of the slowest sensor, or five turns if it turns.
         lost_below: no sensor can see a track that lies in any field of view with less than this probability.
         lost_sigma: a position with a larger standard deviation is not known [m]; default: a quarter of the largest
             field of view.

@@ -313,6 +313,34 @@ def test_the_sum_of_log_lambda_does_not_know_of_survival(way: str) -> None:
     np.testing.assert_allclose(sums[0][:25], sums[1][:25], rtol=1e-9)
 
 
+@pytest.mark.parametrize("way", ["advice", "none", "mirrored", "selected", "centralised"])
+@pytest.mark.parametrize("seeing", ["a", "b"])
+def test_misses_of_the_only_sensor_that_sees_a_track_count_in_full(way: str, seeing: str) -> None:
+    view = {"shape": "disc", "radius": 500.0}
+    places = {seeing: 0.0, "b" if seeing == "a" else "a": 5000.0}
+    tables = [
+        sensor_table(name, position=[places[name], 0.0], p_d=0.8, false_plots=0.1, field_of_view=view) for name in "ab"
+    ]
+    here = {"state": [0.0, 0.0, 0.0, 0.0], "sigma": [5.0, 5.0, 0.5, 0.5]}
+    plot = scenario(
+        *tables,
+        motion={"psd": 0.01},
+        hypothesis=[here],
+        target=[],
+        life={},
+        decision={"enabled": False},
+        fusion=WAYS[way],
+    )
+    scans = [
+        Scan(name, plot.to_ns(2.0 * number), np.array([places[name], 0.0]), np.empty((0, 2)))
+        for number in range(1, 4)
+        for name in "ab"
+    ]
+    pictures, _ = said(plot, scans, way)
+    miss = np.log(1.0 - 0.8 * 0.9997)  # the gate holds so many plots
+    np.testing.assert_allclose([tracks.log_lr_total[0] for tracks in pictures], miss * np.arange(1, 4))
+
+
 def test_live_is_as_replayed_where_tracks_are_lost() -> None:
     plot = leaving({})
     live = live_as_replayed(plot, scans_of(plot, [lambda t: (20.0 * t - 300.0, 50.0)], 70.0))

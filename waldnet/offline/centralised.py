@@ -80,7 +80,8 @@ class Centralised:
         tracker = LocalTracker.of(scenario, scenario.sensor_names[0], Schedule((), ()))
         terms = len(local.motion.models) if isinstance(local.motion, Imm) else 1
         whole = Fuser.of(scenario)
-        fuser = replace(whole, sensors=whole.sensors[:1], share=HONEST, terms=terms, globalised=False)
+        # Whatever the one factor says of a track, all sensors have seen it: nobody in here is blind.
+        fuser = replace(whole, sensors=whole.sensors[:1], share=HONEST, terms=terms, globalised=False, configs=())
         return cls(
             names=scenario.sensor_names,
             tracker=replace(tracker, filter=local, rounding=None, selection=None, buffer_ns=0, schedule=None),

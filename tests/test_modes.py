@@ -13,6 +13,7 @@ from reference import Density, Seer, corrected, predicted
 from waldnet.common.codec import Rounding, encode
 from waldnet.common.config import Scenario
 from waldnet.common.messages import Advice, Decision, Message, Picked, Rebase, Report, Scan, Tracks
+from waldnet.offline.loopback import Sent
 from waldnet.offline.replay import Replay
 from waldnet.scenarios.world import simulate_all, truth
 from waldnet.studies.baselines import with_fusion
@@ -49,19 +50,15 @@ class Overheard(Replay):
     """A replay that remembers what went up and down."""
 
     def __init__(self, plot: Scenario, scans: list[Scan]) -> None:
-        super().__init__(plot, scans)
+        super().__init__(plot, scans, self._overhear)
         self.up: list[Message] = []
         self.down: list[Message] = []
 
-    def _tell_center(self, message: Any) -> Any:
-        if isinstance(message, Report | Picked):
-            self.up.append(message)
-        return super()._tell_center(message)
-
-    def _tell_nodes(self, message: Message) -> None:
-        if isinstance(message, Advice | Rebase):
-            self.down.append(message)
-        super()._tell_nodes(message)
+    def _overhear(self, sent: Sent) -> None:
+        if isinstance(sent.message, Report | Picked):
+            self.up.append(sent.message)
+        if isinstance(sent.message, Advice | Rebase):
+            self.down.append(sent.message)
 
 
 def pictures(plot: Scenario, seed: int) -> tuple[list[Tracks], Overheard]:

@@ -20,11 +20,10 @@ from waldnet.common.config import Scenario
 from waldnet.common.estimation.gaussian import Array, Gaussian
 from waldnet.common.estimation.sensing import Sensor
 from waldnet.common.estimation.sprt import CONFIRMED, DELETED
-from waldnet.common.messages import NEVER, Begin, Join, Keys, Message, Scan, Start, Stop, Tracks
-from waldnet.fusion_center.center import Center
+from waldnet.common.messages import NEVER, Keys, Scan, Tracks
+from waldnet.offline.loopback import Loopback
 from waldnet.recording.lines import TrackLines
 from waldnet.scenarios.world import simulate_all
-from waldnet.sensor_node.tracker import LocalTracker
 
 Area: TypeAlias = Literal["grows", "same"]
 
@@ -88,53 +87,36 @@ class Steps:
     """Nodes and center in this process, each step and its codec timed."""
 
     def __init__(self, scenario: Scenario) -> None:
-        self.center = Center.of(scenario, speed=0.0)
-        self.state = self.center.initial()
-        self.trackers = {name: LocalTracker.of(scenario, name) for name in scenario.sensor_names}
-        self.nodes = {name: tracker.initial() for name, tracker in self.trackers.items()}
+        self.network = Loopback.of(scenario)
         self.keys = Keys(scenario.name)
         self.lines = TrackLines(scenario)
         self.tracks: Tracks | None = None
 
     def join(self, first_ns: dict[str, int]) -> None:
         """All nodes join; the first scan of each is due at the given times."""
-        for incarnation, (name, time_ns) in enumerate(first_ns.items()):
-            self.state, said = self.center.step(self.state, Join(name, incarnation, time_ns, self.center.digest), 0)
-            self.tell(said)
+        for name, time_ns in first_ns.items():
+            self.network.join(name, time_ns)
 
     def scan(self, scan: Scan, next_ns: int) -> dict[str, float]:
         """Milliseconds of the parts of one scan."""
-        name, began = scan.sensor, time.process_time()
-        self.nodes[name], report = self.trackers[name].scan(self.nodes[name], scan, next_ns)
-        payload = encode(report)
+        network, began = self.network, time.process_time()
+        payload = encode(network.report(scan, next_ns))
         reported = time.process_time()
-        message = decode(self.keys.report(name), payload)
+        message = decode(self.keys.report(scan.sensor), payload)
         assert not isinstance(message, Tracks)
-        self.state, said = self.center.step(self.state, message, 0)  # type: ignore[arg-type]
+        said = network.fuse(message)  # type: ignore[arg-type]
         for one in said:
             encode(one)
         fused = time.process_time()
-        self.tell(said)
+        network.tell(said)
         told = time.process_time()
         pictures = [one for one in said if isinstance(one, Tracks)]
         for picture in pictures:
             self.tracks = picture
             for _ in self.lines.of(picture):
                 pass
-        parts = {"node": reported - began, "center": fused - reported, "told": (told - fused) / len(self.nodes)}
+        parts = {"node": reported - began, "center": fused - reported, "told": (told - fused) / len(network.nodes)}
         return {part: 1e3 * took for part, took in {**parts, "lines": time.process_time() - told}.items()}
-
-    def tell(self, said: Sequence[Message]) -> None:
-        """Let the nodes hear what the center said."""
-        for message in said:
-            match message:
-                case Start(sensor=name) | Stop(sensor=name):
-                    self.nodes[name] = self.trackers[name].told(self.nodes[name], message)
-                case Begin():
-                    for name, tracker in self.trackers.items():
-                        self.nodes[name] = tracker.told(self.nodes[name], message)
-                case _:
-                    pass
 
 
 def measure(cell: Cell, peer_up_to: int = 100) -> dict[str, Any]:

@@ -24,11 +24,10 @@ import numpy as np
 from waldnet.benchmarks.machine import machine
 from waldnet.common.config import DecisionConfig, Scenario, load_scenario
 from waldnet.common.fusion_config import FusionConfig
-from waldnet.common.messages import Join, Scan, Start
-from waldnet.fusion_center.center import Center
+from waldnet.common.messages import Scan
+from waldnet.offline.loopback import Loopback
 from waldnet.scenarios.catalogue import find
 from waldnet.scenarios.world import simulate
-from waldnet.sensor_node.tracker import LocalTracker
 
 TRACKS = (1, 5, 10, 100, 1000)
 SCANS = 5
@@ -58,19 +57,16 @@ def network(name: str, mode: str, tracks: int) -> Scenario:
 def steps(scenario: Scenario) -> dict[str, Callable[[], object]]:
     """The last radar's last scan and the center's last report of it, as calls that can be repeated."""
     scans: dict[str, list[Scan]] = {name: simulate(scenario, name, 1) for name in scenario.sensor_names}
-    trackers = {name: LocalTracker.of(scenario, name) for name in scans}
-    center = Center.of(scenario)
-    fused, nodes = center.initial(), {name: tracker.initial() for name, tracker in trackers.items()}
+    network = Loopback.of(scenario)
     for name, own in scans.items():
-        fused, messages = center.step(fused, Join(name, 1, own[0].time_ns, center.digest), 0)
-        starts = [message for message in messages if isinstance(message, Start)]
-        nodes[name] = trackers[name].start(nodes[name], starts[0])
+        network.join(name, own[0].time_ns)
     for at in range(SCANS):
-        for name, tracker in trackers.items():
-            scan, next_ns = scans[name][at], scans[name][at + 1].time_ns
-            before, waiting = nodes[name], fused
-            nodes[name], report = tracker.scan(before, scan, next_ns)
-            fused, _ = center.step(waiting, report, 0)
+        for name, own in scans.items():
+            scan, next_ns = own[at], own[at + 1].time_ns
+            before, waiting = network.nodes[name], network.state
+            report = network.report(scan, next_ns)
+            network.fuse(report)
+    tracker, center = network.trackers[name], network.center
     ready, expecting = tracker.prepare(before, scan.time_ns, scan.pose), center.prepare(waiting)
     return {
         "node": lambda: tracker.scan(before, scan, next_ns),

@@ -21,9 +21,10 @@ from scipy.spatial import KDTree
 from waldnet.benchmarks.worlds import World
 from waldnet.common.codec import Rounding, encode
 from waldnet.common.config import Network
-from waldnet.common.messages import Join, Keys, Message, Report, Scan, Start
+from waldnet.common.messages import Keys, Message, Report, Scan
 from waldnet.common.transport import open_zenoh
 from waldnet.fusion_center.center import Center
+from waldnet.offline.loopback import Loopback
 from waldnet.sensor_node.tracker import LocalTracker
 
 PORT = 7447
@@ -47,15 +48,10 @@ def messages(world: World, name: str, kind: str) -> Iterator[Message]:
 
 def _reports(world: World, name: str, scans: list[Scan]) -> Iterator[Message]:
     scenario = world.scenario()
-    tracker, center = LocalTracker.of(scenario, name), Center.of(scenario)
-    _, answers = center.step(center.initial(), Join(name, 1, scans[0].time_ns, center.digest), 0)
-    state = tracker.initial()
-    for answer in answers:
-        if isinstance(answer, Start):
-            state = tracker.start(state, answer)
+    network = Loopback(Center.of(scenario), [LocalTracker.of(scenario, name)])
+    network.join(name, scans[0].time_ns)
     for scan in scans:
-        state, report = tracker.scan(state, scan, _next_ns(world, scan))
-        yield report
+        yield network.report(scan, _next_ns(world, scan))
 
 
 def _proposals(world: World, scan: Scan) -> Report:

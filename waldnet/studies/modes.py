@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from waldnet.common.codec import as_sent, encode
+from waldnet.common.codec import encode
 from waldnet.common.config import Scenario
 from waldnet.common.estimation.gaussian import Gaussian
-from waldnet.common.messages import NEVER, Advice, Join, Rebase, Start
+from waldnet.common.messages import NEVER, Advice, Rebase
 from waldnet.fusion_center.center import Center
+from waldnet.offline.loopback import Loopback
 from waldnet.sensor_node.state import Look as NodeLook
 from waldnet.sensor_node.state import Schedule
 from waldnet.sensor_node.tracker import LocalTracker
@@ -55,54 +56,41 @@ def distributed(scenario: Scenario, worlds: Worlds, **fusion: Any) -> Course:
 
 
 class _Network:
-    """Nodes and center, and what goes between them."""
+    """Nodes and center, and the bytes that go between them."""
 
     def __init__(self, scenario: Scenario, center: Center, worlds: Worlds) -> None:
         schedule = _schedule(worlds.looks)
-        self._worlds, self._center, self._state = worlds, center, center.initial()
-        self._names = scenario.sensor_names
-        self._trackers = [LocalTracker.of(scenario, name, schedule) for name in self._names]
-        self._nodes = [tracker.initial() for tracker in self._trackers]
-        self._down = 0
-        for number, name in enumerate(self._names):
-            self._tell(Join(name, number, self._next_ns(number, -1), center.digest))
+        trackers = [LocalTracker.of(scenario, name, schedule) for name in scenario.sensor_names]
+        self._worlds, self._network = worlds, Loopback(center, trackers)
+        self._up = self._down = 0
+        for number, name in enumerate(scenario.sensor_names):
+            self._network.join(name, self._next_ns(number, -1))
 
     def run(self) -> Course:
         """All scans."""
         looks, runs = self._worlds.looks, len(self._worlds.seeds)
-        x, P, log_lr, up = [], [], [], 0
+        x, P, log_lr = [], [], []
         for i, look in enumerate(looks):
-            tracker, node = self._trackers[look.sensor], self._nodes[look.sensor]
-            scan = NodeLook(look.time_ns, look.pose, own(look.plots), look.sensor)
-            self._nodes[look.sensor], report = tracker.look(node, scan, self._next_ns(look.sensor, i))
-            up += len(encode(report, rounding=tracker.rounding))
-            self._tell(as_sent(report, tracker.rounding))
+            self._work_in(NodeLook(look.time_ns, look.pose, own(look.plots), look.sensor), i)
             if i + 1 == len(looks) or looks[i + 1].time_ns > look.time_ns:
-                picture = self._state.picture
+                picture = self._network.state.picture
                 log_lr.append(picture.log_lr_total)
                 x.append(picture.fused_x)
                 P.append(picture.fused_P)
         per_scan = len(looks) * runs
-        return Course(np.stack(log_lr, 1), np.stack(x, 1), np.stack(P, 1), up / per_scan, self._down / per_scan)
+        up, down = self._up / per_scan, self._down / per_scan
+        return Course(np.stack(log_lr, 1), np.stack(x, 1), np.stack(P, 1), up, down)
+
+    def _work_in(self, look: NodeLook, at: int) -> None:
+        network = self._network
+        report = network.report(look, self._next_ns(look.number, at))
+        rounding = network.trackers[report.sensor].rounding
+        self._up += len(encode(report, rounding=rounding))
+        answers = network.deliver(report)
+        self._down += sum(len(encode(answer)) for answer in answers if isinstance(answer, Advice | Rebase))
 
     def _next_ns(self, sensor: int, after: int) -> int:
         return next((look.time_ns for look in self._worlds.looks[after + 1 :] if look.sensor == sensor), NEVER)
-
-    def _tell(self, message: Any) -> None:
-        self._state, answers = self._center.step(self._state, message, 0)
-        for answer in answers:
-            match answer:
-                case Start(sensor=name):
-                    number = self._names.index(name)
-                    self._nodes[number] = self._trackers[number].start(self._nodes[number], answer)
-                case Advice():
-                    self._down += len(encode(answer))
-                    self._nodes = [t.advise(node, answer) for t, node in zip(self._trackers, self._nodes, strict=True)]
-                case Rebase():
-                    self._down += len(encode(answer))
-                    self._nodes = [t.rebase(node, answer) for t, node in zip(self._trackers, self._nodes, strict=True)]
-                case _:
-                    pass
 
 
 def _schedule(looks: tuple[Look, ...]) -> Schedule:

@@ -23,6 +23,22 @@ SENSORS = (ROOT / "docs/how-to/sensors.md").read_text()
 EVALUATE = (ROOT / "docs/how-to/evaluate.md").read_text()
 MEASURE = (ROOT / "docs/how-to/measure.md").read_text()
 DEPLOY = (ROOT / "docs/how-to/deploy.md").read_text()
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+MORE_PAGES = [ROOT / "CHANGELOG.md", *sorted((ROOT / "scenarios").glob("*/README.md"))]
+LONGEST_LINE = 120
+#: Pages whose lines are still longer, to be shortened.
+LONG_LINES = {
+    "CHANGELOG.md",
+    "docs/many-targets.md",
+    "docs/performance.md",
+    "docs/real-runs.md",
+    "docs/studies.md",
+    "docs/theory.md",
+    "docs/wire-format.md",
+    "scenarios/autoferry/README.md",
+    "scenarios/joyride/README.md",
+    "scenarios/solent/README.md",
+}
 WALDNET = str(Path(sys.executable).with_name("waldnet"))
 
 
@@ -200,7 +216,39 @@ def test_schema_is_the_one_the_program_prints() -> None:
     assert (ROOT / "scenarios/scenario.schema.json").read_text() == run([WALDNET, "schema"], ROOT)
 
 
-@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))], ids=lambda p: p.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.name)
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text()):
         assert (page.parent / target).exists(), target
+
+
+def prose(page: str) -> list[str]:
+    """Lines that can be broken: those outside tables, code, comments, and of more than a link."""
+    blank = re.sub(r"^```.*?^```|<!--.*?-->", "", page, flags=re.DOTALL | re.MULTILINE)
+    return [
+        line
+        for line in blank.splitlines()
+        if not line.startswith(("|", "    ")) and not re.fullmatch(r"[-*\d. ]*!?(\[.*?\]\(\S+\)|<?https?:\S+)", line)
+    ]
+
+
+def test_prose_is_what_can_be_broken() -> None:
+    page = """word
+| cell |
+```sh
+fenced
+```
+<!-- a
+comment -->
+    indented
+- [a link](docs/x.md)
+https://example.org
+a sentence with [a link](docs/x.md)
+"""
+    assert [line for line in prose(page) if line] == ["word", "a sentence with [a link](docs/x.md)"]
+
+
+@pytest.mark.parametrize("page", [*PAGES, *MORE_PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_lines_are_short(page: Path) -> None:
+    long = [line for line in prose(page.read_text()) if len(line) > LONGEST_LINE]
+    assert not long or str(page.relative_to(ROOT)) in LONG_LINES, long

@@ -18,6 +18,11 @@ if not os.environ.get("WALDNET_EXPLORE"):
     settings.load_profile("fixed")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The flag that writes the protocol traces anew."""
+    parser.addoption("--rewrite-traces", action="store_true", help="write tests/traces/*.txt anew")
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Look for what network namespaces need; ``WALDNET_MUST_RUN=netns`` says that it must be there."""
     if item.get_closest_marker("netns") is None or not (lacking := Namespaces.lacking()):

@@ -34,7 +34,6 @@ LONG_LINES = {
     "docs/real-runs.md",
     "docs/studies.md",
     "docs/theory.md",
-    "docs/wire-format.md",
     "scenarios/autoferry/README.md",
     "scenarios/joyride/README.md",
     "scenarios/solent/README.md",

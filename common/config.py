@@ -276,17 +276,31 @@ def load_scenario(path: Path) -> Scenario:
     Raises:
         ConfigError: naming every fault.
     """
-    data = _read_toml(path)
-    if isinstance(name := data.get("name"), str) and isinstance(network := data.setdefault("network", {}), dict):
-        network.setdefault("name", name)
+    return make_scenario(_read_toml(path), path.parent, str(path))
+
+
+def make_scenario(data: Mapping[str, Any], folder: Path, where: str) -> Scenario:
+    """Validate the tables of a scenario.
+
+    Args:
+        data: as a scenario file has them: dicts, lists, numbers, texts.
+        folder: from which relative paths count.
+        where: the tables come from, for messages.
+
+    Raises:
+        ConfigError: naming every fault.
+    """
+    data = dict(data)
+    if isinstance(name := data.get("name"), str) and isinstance(network := data.get("network", {}), dict):
+        data["network"] = {"name": name, **network}
     faults = list(_cross_faults(data))
     try:
         scenario = Scenario.model_validate(data)
     except ValidationError as error:
         faults = [*_describe_all(error), *faults]
     if faults:
-        raise ConfigError("\n".join(f"{path}: {fault}" for fault in faults))
-    return _beside(path.parent, scenario)
+        raise ConfigError("\n".join(f"{where}: {fault}" for fault in faults))
+    return _beside(folder, scenario)
 
 
 def _beside(folder: Path, scenario: Scenario) -> Scenario:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import sys
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, TextIO
 
@@ -31,6 +31,11 @@ _POSE = ("position", "velocity", "heading")
 
 
 def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
+    """Read and validate a file of recorded plots; arguments, order and errors as for ``read_entries``."""
+    return [scan for scan, _ in read_entries(path, scenario)]
+
+
+def read_entries(path: Path, scenario: Scenario) -> list[tuple[Scan, dict[str, Any]]]:
     """Read and validate a file of recorded plots.
 
     Args:
@@ -38,7 +43,7 @@ def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
         scenario: names its sensors and their dimensions, and the sensors of the recording that it ignores.
 
     Returns:
-        the scans, by time; those of one time in the order of the scenario's sensors.
+        the scans, each with the object of its line, by time; those of one time in the order of the scenario's sensors.
 
     Raises:
         PlotsError: naming file, line and reason of every fault, up to a bound.
@@ -48,24 +53,26 @@ def read_plots(path: Path, scenario: Scenario) -> list[Scan]:
     """
     first_line: dict[tuple[str, int], int] = {}
 
-    def parse(entry: dict[str, Any], number: int) -> Scan | None:
-        scan = _parse(entry, scenario)
+    def parse(entry: dict[str, Any], number: int) -> tuple[Scan | None, dict[str, Any]]:
+        scan = scan_of(entry, scenario)
         if scan is not None and (before := first_line.setdefault((scan.sensor, scan.time_ns), number)) != number:
             raise ValueError(
                 f"{scan.sensor} has a scan at {scenario.to_seconds(scan.time_ns)} s already, line {before}"
             )
-        return scan
+        return scan, entry
 
     lines = read_lines(path, "scan", ("sensor", "time", "plots"), parse, PlotsError, _POSE)
-    scans = [scan for scan in lines if scan is not None]
-    if not scans:
+    read = [(scan, entry) for scan, entry in lines if scan is not None]
+    if not read:
         raise PlotsError(f"{path}: has no scan, expected one a line")
-    scans = in_order(scans, scenario)
+    place = _place(scenario)
+    read.sort(key=lambda each: place(each[0]))
+    scans = [scan for scan, _ in read]
     for config in scenario.sensors:
         if config.kind == "polar-doppler":
             own = [scan for scan in scans if scan.sensor == config.name]
             _check_velocities(path, own, [first_line[scan.sensor, scan.time_ns] for scan in own])
-    return scans
+    return read
 
 
 def _check_velocities(path: Path, scans: Sequence[Scan], lines: Sequence[int]) -> None:
@@ -91,13 +98,19 @@ def _check_velocities(path: Path, scans: Sequence[Scan], lines: Sequence[int]) -
             f"{np.median(speeds):.3g} m/s), but no velocity is told: its range rates are taken as over ground. If they "
             "are relative to the sensor, each line needs its velocity; else velocity = [0, 0] in [[sensor]] says so"
         )
-        warnings.warn(text.replace("[0, 0]", str([0] * positions.shape[1])), PlotsWarning, stacklevel=3)
+        warnings.warn(text.replace("[0, 0]", str([0] * positions.shape[1])), PlotsWarning, stacklevel=4)
 
 
 def in_order(scans: Iterable[Scan], scenario: Scenario) -> list[Scan]:
     """Scans by time; those of one time in the order of the scenario's sensors."""
+    place = _place(scenario)
+    return sorted(scans, key=place)
+
+
+def _place(scenario: Scenario) -> Callable[[Scan], tuple[int, int]]:
+    """Tells the place of a scan among the others: its time, then the number of its sensor."""
     numbers = {name: number for number, name in enumerate(scenario.sensor_names)}
-    return sorted(scans, key=lambda scan: (scan.time_ns, numbers[scan.sensor]))
+    return lambda scan: (scan.time_ns, numbers[scan.sensor])
 
 
 def write_plots(file: TextIO, scans: Iterable[Scan], scenario: Scenario) -> None:
@@ -107,6 +120,11 @@ def write_plots(file: TextIO, scans: Iterable[Scan], scenario: Scenario) -> None
 
 def plots_line(scan: Scan, scenario: Scenario) -> str:
     """A scan as JSON."""
+    return json.dumps(plots_entry(scan, scenario))
+
+
+def plots_entry(scan: Scan, scenario: Scenario) -> dict[str, Any]:
+    """A scan as the object of a line."""
     config = scenario.sensor(scan.sensor)
     relative = config.azimuth == "heading"
     line: dict[str, Any] = {
@@ -119,11 +137,15 @@ def plots_line(scan: Scan, scenario: Scenario) -> str:
     if relative or scan.heading != (config.heading or 0.0):
         line["heading"] = scan.heading
     line["plots"] = (_turned(scan.z, config, -scan.heading) if relative else scan.z).tolist()
-    return json.dumps(line)
+    return line
 
 
-def _parse(entry: dict[str, Any], scenario: Scenario) -> Scan | None:
-    """The scan of a line; None if the scenario ignores its sensor."""
+def scan_of(entry: dict[str, Any], scenario: Scenario) -> Scan | None:
+    """The scan of a line's object; None if the scenario ignores its sensor.
+
+    Raises:
+        ValueError: saying what is wrong with it.
+    """
     name, time_s = entry["sensor"], seconds(entry["time"])
     if scenario.recording is not None and name in scenario.recording.ignore:
         return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,10 +66,12 @@ def source(scenario: Scenario, name: str, *, plots: Path | None = None, seed: in
     """What the named sensor sees; arguments and errors as for ``all_scans``."""
     recording = recording_of(scenario, plots)
     if recording is None:
+        spacing = Spacing.of(scenario)
         times = [
             (int(t_ns), number)
             for number, sensor in enumerate(scenario.sensors)
-            for t_ns in _spaced(scan_times_ns(scenario, sensor).tolist(), sensor.spacing)
+            for t_ns in scan_times_ns(scenario, sensor).tolist()
+            if spacing.keeps(sensor.name, t_ns)
         ]
         scans = spaced(simulate(scenario, name, seed_of(scenario, seed)), scenario)
         return Source(scans, _schedule(sorted(times)))
@@ -77,22 +79,37 @@ def source(scenario: Scenario, name: str, *, plots: Path | None = None, seed: in
     return Source([scan for scan in scans if scan.sensor == name], schedule_of(scans, scenario))
 
 
-def spaced(scans: Sequence[Scan], scenario: Scenario) -> list[Scan]:
-    """Without the scans that come sooner after the last one of their sensor than its ``spacing``."""
-    kept: set[tuple[str, int]] = set()
-    for sensor in scenario.sensors:
-        times_ns = sorted(scan.time_ns for scan in scans if scan.sensor == sensor.name)
-        kept.update((sensor.name, time_ns) for time_ns in _spaced(times_ns, sensor.spacing))
-    return [scan for scan in scans if (scan.sensor, scan.time_ns) in kept]
+class Spacing:
+    """Leaves out scans that come sooner after the last one of their sensor than its ``spacing``."""
+
+    def __init__(self, spacings_s: Mapping[str, float]) -> None:
+        """From the spacing of every sensor [s]."""
+        self._spacings_s = spacings_s
+        self._last_ns: dict[str, int] = {}
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> Spacing:
+        """For the sensors of a scenario."""
+        return cls({sensor.name: sensor.spacing for sensor in scenario.sensors})
+
+    def keeps(self, sensor: str, time_ns: int) -> bool:
+        """Whether the next scan of a sensor stays; one that is older than the last is not for this to judge."""
+        last_ns = self._last_ns.get(sensor, -NEVER)
+        if last_ns < time_ns < last_ns + round(self._spacings_s.get(sensor, 0.0) * NS_PER_S):
+            return False
+        self._last_ns[sensor] = time_ns
+        return True
 
 
-def _spaced(times_ns: Iterable[int], spacing_s: float) -> Iterator[int]:
-    """Of ascending times those that are far enough from the last one."""
-    next_ns = -NEVER
-    for time_ns in times_ns:
-        if time_ns >= next_ns:
-            next_ns = time_ns + round(spacing_s * NS_PER_S)
-            yield time_ns
+def spaced(scans: Iterable[Scan], scenario: Scenario) -> list[Scan]:
+    """Without the scans that come sooner after the last one of their sensor than its ``spacing``.
+
+    Args:
+        scans: those of each sensor by time.
+        scenario: says the spacings.
+    """
+    spacing = Spacing.of(scenario)
+    return [scan for scan in scans if spacing.keeps(scan.sensor, scan.time_ns)]
 
 
 def schedule_of(scans: Iterable[Scan], scenario: Scenario) -> Schedule:

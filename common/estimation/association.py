@@ -12,9 +12,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import gammaincinv
 
 from waldnet.common.estimation.field_of_view import View
@@ -24,6 +25,7 @@ from waldnet.common.estimation.gaussian import (
     Array,
     BoolArray,
     Gaussian,
+    as_array,
     identity,
     joseph,
     settled_whitener,
@@ -39,8 +41,16 @@ _FEW_PAIRS = 4000
 _LOWEST = float(np.finfo(np.float64).min)
 
 
-class Plots(NamedTuple):
-    """The plots of one scan, ragged scans of a batch padded.
+class _PlotsFields(NamedTuple):
+    z: Array
+    valid: BoolArray | None
+    log_relative: Array | None
+    number: IntArray | None
+    log_in_view: Array | None
+
+
+class Plots(_PlotsFields):
+    """The plots of one scan, ragged scans of a batch padded; lists of numbers are welcome.
 
     Attributes:
         z: shape (..., M, m).
@@ -52,15 +62,29 @@ class Plots(NamedTuple):
             (..., M). None: it surely is, or ``in_view`` has not worked it out yet.
     """
 
-    z: Array
-    valid: BoolArray | None = None
-    log_relative: Array | None = None
-    number: IntArray | None = None
-    log_in_view: Array | None = None
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        z: ArrayLike,
+        valid: BoolArray | None = None,
+        log_relative: Array | None = None,
+        number: IntArray | None = None,
+        log_in_view: Array | None = None,
+    ) -> Self:
+        """Take lists for arrays."""
+        return tuple.__new__(cls, (as_array(z), valid, log_relative, number, log_in_view))
 
 
-class Clutter(NamedTuple):
-    """How a sensor detects, and what it takes for a target.
+class _ClutterFields(NamedTuple):
+    p_d: Array
+    log_rho_f: Array
+    p_g: float
+    view: View | None
+
+
+class Clutter(_ClutterFields):
+    """How a sensor detects, and what it takes for a target; plain numbers are welcome.
 
     Attributes:
         p_d: detection probability in the field of view, shape (...).
@@ -69,10 +93,11 @@ class Clutter(NamedTuple):
         view: where a target can be detected; None: everywhere.
     """
 
-    p_d: Array
-    log_rho_f: Array
-    p_g: float
-    view: View | None = None
+    __slots__ = ()
+
+    def __new__(cls, p_d: ArrayLike, log_rho_f: ArrayLike, p_g: float, view: View | None = None) -> Self:
+        """Take lists for arrays."""
+        return tuple.__new__(cls, (as_array(p_d), as_array(log_rho_f), p_g, view))
 
 
 class Expected(NamedTuple):
@@ -466,8 +491,49 @@ def pdaf(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter
     References:
         theory.md Eq. (6), (7); Bar-Shalom, Daum & Huang, The probabilistic data association filter (2009).
     """
+    return _filter(predicted, plots, sensor, clutter, normalise)
+
+
+def nearest_neighbour(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter) -> Filtered:
+    """Nearest neighbour filter: the most probable hypothesis of a scan, missed detection included, counts alone.
+
+    Args:
+        predicted: shapes (..., n), (..., n, n).
+        plots: of the scan; no plots is evidence too.
+        sensor: linearised at ``predicted.x``.
+        clutter: detection probability, false plots, gate.
+
+    Returns:
+        the posterior, and the logarithm of that hypothesis' weight in place of log p_bar.
+
+    References:
+        theory.md §9.
+    """
+    return _filter(predicted, plots, sensor, clutter, nearest)
+
+
+def kalman_filter(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter) -> Filtered:
+    """Kalman filter with a gate: the closest plot in the gate is the target's; none there is a missed detection.
+
+    Args:
+        predicted: shapes (..., n), (..., n, n).
+        plots: of the scan; none leaves the prediction as it is.
+        sensor: linearised at ``predicted.x``.
+        clutter: detection probability, false plots, gate (``p_g = 1``: every plot is in it).
+
+    Returns:
+        the posterior, and the logarithm of the weight of what was taken for true in place of log p_bar.
+
+    References:
+        theory.md §9.
+    """
+    return _filter(predicted, plots, sensor, clutter, kalman)
+
+
+def _filter(predicted: Gaussian, plots: Plots, sensor: Linearised, clutter: Clutter, choose: Choice) -> Filtered:
+    """Filter tracks that have one density each."""
     one = Gaussian(predicted.x[None], predicted.P[None])
-    density, log_p_bar = update(expect(one, sensor._replace(z=sensor.z[None]), clutter), plots)
+    density, log_p_bar = update(expect(one, sensor._replace(z=sensor.z[None]), clutter), plots, choose)
     return Filtered(Gaussian(density.x[0], density.P[0]), log_p_bar)
 
 

@@ -11,15 +11,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from waldnet.common.estimation.association import Clutter, Expected, Plots, expect, within_reach
 from waldnet.common.estimation.batch import concatenate, take
 from waldnet.common.estimation.detection import Notch
 from waldnet.common.estimation.gating import IntArray
-from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, log_sum_exp
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, as_array, log_sum_exp
 from waldnet.common.estimation.mixture import Mixture, Reduction, step, step_with
 from waldnet.common.estimation.motion import Motion, predict
 from waldnet.common.estimation.notch import hypotheses
@@ -27,8 +28,16 @@ from waldnet.common.estimation.sensing import Sensor
 from waldnet.common.estimation.sprt import DELETED, StatusArray, Thresholds, decide
 
 
-class SensorScan(NamedTuple):
-    """One scan of one sensor.
+class _SensorScanFields(NamedTuple):
+    time: float
+    sensor: Sensor
+    stand: Array
+    center: Array
+    plots: Plots
+
+
+class SensorScan(_SensorScanFields):
+    """One scan of one sensor; lists of numbers are welcome.
 
     Attributes:
         time: of the scan [s].
@@ -38,11 +47,14 @@ class SensorScan(NamedTuple):
         plots: z of shape (M, m), which all candidates share; or of every candidate, shape (T, 1, M, m).
     """
 
-    time: float
-    sensor: Sensor
-    stand: Array
-    center: Array
-    plots: Plots
+    __slots__ = ()
+
+    def __new__(
+        cls, time: float, sensor: Sensor, stand: ArrayLike, center: ArrayLike, plots: Plots | ArrayLike
+    ) -> Self:
+        """Take lists for arrays."""
+        plots = plots if isinstance(plots, Plots) else Plots(plots)
+        return tuple.__new__(cls, (time, sensor, as_array(stand), as_array(center), plots))
 
 
 class Candidates(NamedTuple):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from functools import cache, lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.linalg.lapack import dpotrf, dtrtri
 
 Array: TypeAlias = NDArray[np.float64]
@@ -18,16 +18,29 @@ _FEW = 4
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
-class Gaussian(NamedTuple):
-    """Gaussian densities, one per leading batch index.
+def as_array(value: ArrayLike) -> Array:
+    """Numbers as an array; an array is taken as it is, at next to no cost."""
+    return value if type(value) is np.ndarray else np.asarray(value, np.float64)
+
+
+class _GaussianFields(NamedTuple):
+    x: Array
+    P: Array
+
+
+class Gaussian(_GaussianFields):
+    """Gaussian densities, one per leading batch index; lists of numbers are welcome.
 
     Attributes:
         x: means, shape (..., n).
         P: covariances, shape (..., n, n), symmetric positive definite.
     """
 
-    x: Array
-    P: Array
+    __slots__ = ()
+
+    def __new__(cls, x: ArrayLike, P: ArrayLike) -> Self:
+        """Take lists for arrays."""
+        return tuple.__new__(cls, (as_array(x), as_array(P)))
 
 
 class Whitened(NamedTuple):

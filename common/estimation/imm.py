@@ -17,9 +17,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from waldnet.common.estimation.association import Clutter, Plots, pdaf
-from waldnet.common.estimation.gaussian import Array, Gaussian, draw_noise, log_sum_exp, moments
+from waldnet.common.estimation.gaussian import Array, Gaussian, as_array, draw_noise, log_sum_exp, moments
 from waldnet.common.estimation.motion import (
     ConstantAcceleration,
     ConstantVelocity,
@@ -125,23 +126,23 @@ class Imm(NamedTuple):
         r = len(self.models)
         return r / (max(r - 1, 1) * self.sojourn)
 
-    def transition(self, dt: Array) -> Array:
+    def transition(self, dt: ArrayLike) -> Array:
         """F of the nominal model over ``dt`` seconds, shape (...) to (..., n, n)."""
         return self.nominal.transition(dt)
 
-    def noise(self, dt: Array) -> Array:
+    def noise(self, dt: ArrayLike) -> Array:
         """Q of the nominal model over ``dt`` seconds, shape (...) to (..., n, n)."""
         return self.nominal.noise(dt)
 
-    def transitions(self, dt: Array) -> Array:
+    def transitions(self, dt: ArrayLike) -> Array:
         """F of every model over ``dt`` seconds, shape (...) to (..., r, n, n)."""
         return np.stack([model.transition(dt) for model in self.models], axis=-3)
 
-    def noises(self, dt: Array) -> Array:
+    def noises(self, dt: ArrayLike) -> Array:
         """Q of every model over ``dt`` seconds, shape (...) to (..., r, n, n)."""
         return np.stack([model.noise(dt) for model in self.models], axis=-3)
 
-    def mode_transition(self, dt: Array) -> Array:
+    def mode_transition(self, dt: ArrayLike) -> Array:
         """Probabilities of mode j after ``dt`` seconds given mode i before: expm(generator dt), rows sum to one.
 
         With equal rates the exponential is closed: with ``e = exp(-dt r / ((r - 1) sojourn))`` the chain has become
@@ -154,7 +155,7 @@ class Imm(NamedTuple):
             shape (..., r, r), [i, j] from i to j.
         """
         r = len(self.models)
-        other = -np.expm1(-dt * self._rate) / r
+        other = -np.expm1(-as_array(dt) * self._rate) / r
         eye = np.eye(r)
         off = np.asarray(other)[..., None, None]
         return eye * (1.0 - (r - 1) * off) + (1.0 - eye) * off

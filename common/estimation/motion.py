@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from waldnet.common.estimation.gaussian import Array, Gaussian, identity, symmetric, times_transposed
+from waldnet.common.estimation.gaussian import Array, Gaussian, as_array, identity, symmetric, times_transposed
 
 #: Of the power series of (theta - sin theta) / theta^3: 6 / (2 k + 3)! is below 1e-16 from k = 8 on.
 _TERMS = 8
@@ -25,11 +26,11 @@ class Motion(Protocol):
         """Size of the position, 2 or 3."""
         ...
 
-    def transition(self, dt: Array) -> Array:
+    def transition(self, dt: ArrayLike) -> Array:
         """F over ``dt`` seconds, shape (...) to (..., n, n)."""
         ...
 
-    def noise(self, dt: Array) -> Array:
+    def noise(self, dt: ArrayLike) -> Array:
         """Q over ``dt`` seconds, shape (...) to (..., n, n)."""
         ...
 
@@ -55,12 +56,14 @@ class ConstantVelocity(NamedTuple):
         """Size of the state."""
         return 2 * self.dimensions
 
-    def transition(self, dt: Array) -> Array:
+    def transition(self, dt: ArrayLike) -> Array:
         """F over ``dt`` seconds, shape (...) to (..., n, n)."""
+        dt = as_array(dt)
         return _each_axis(((1.0, dt), (0.0, 1.0)), dt, self.dimensions)
 
-    def noise(self, dt: Array) -> Array:
+    def noise(self, dt: ArrayLike) -> Array:
         """Q over ``dt`` seconds, shape (...) to (..., n, n)."""
+        dt = as_array(dt)
         cross = self.psd * dt**2 / 2.0
         return _each_axis(((self.psd * dt**3 / 3.0, cross), (cross, self.psd * dt)), dt, self.dimensions)
 
@@ -86,12 +89,14 @@ class ConstantAcceleration(NamedTuple):
         """Size of the state."""
         return 3 * self.dimensions
 
-    def transition(self, dt: Array) -> Array:
+    def transition(self, dt: ArrayLike) -> Array:
         """F over ``dt`` seconds, shape (...) to (..., n, n)."""
+        dt = as_array(dt)
         return _each_axis(((1.0, dt, 0.5 * dt**2), (0.0, 1.0, dt), (0.0, 0.0, 1.0)), dt, self.dimensions)
 
-    def noise(self, dt: Array) -> Array:
+    def noise(self, dt: ArrayLike) -> Array:
         """Q over ``dt`` seconds, shape (...) to (..., n, n)."""
+        dt = as_array(dt)
         q, square = self.psd * dt, dt * dt
         pp, pv, pa = q * square * square / 20.0, q * square * dt / 8.0, q * square / 6.0
         return _each_axis(((pp, pv, pa), (pv, 2.0 * pa, 0.5 * q * dt), (pa, 0.5 * q * dt, q)), dt, self.dimensions)
@@ -129,8 +134,9 @@ class CoordinatedTurn(NamedTuple):
         """Size of the state."""
         return 2 * self.dimensions
 
-    def transition(self, dt: Array) -> Array:
+    def transition(self, dt: ArrayLike) -> Array:
         """F over ``dt`` seconds, shape (...) to (..., n, n)."""
+        dt = as_array(dt)
         theta = self.turn_rate * dt
         along, across = dt * np.sinc(theta / np.pi), 0.5 * theta * dt * _half(theta)
         F = _each_axis(((1.0, dt), (0.0, 1.0)), dt, self.dimensions)
@@ -138,8 +144,9 @@ class CoordinatedTurn(NamedTuple):
         _turn(F, self.dimensions, self.dimensions, np.cos(theta), np.sin(theta))
         return F
 
-    def noise(self, dt: Array) -> Array:
+    def noise(self, dt: ArrayLike) -> Array:
         """Q over ``dt`` seconds, shape (...) to (..., n, n)."""
+        dt = as_array(dt)
         theta, q = self.turn_rate * dt, self.psd * dt
         cubic = _cubic(theta)
         Q = _each_axis(((q * dt**2 / 3.0, q * dt / 2.0), (q * dt / 2.0, q)), dt, self.dimensions)

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from waldnet.common.estimation.detection import Constant, Detection, Notch
 from waldnet.common.estimation.field_of_view import AllAround, Everywhere, FieldOfView, View
-from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian
+from waldnet.common.estimation.gaussian import Array, BoolArray, Gaussian, as_array
 from waldnet.common.estimation.pose import SensorPose
 from waldnet.common.estimation.visibility import Visibility
 
@@ -198,11 +199,11 @@ class Sensor(NamedTuple):
         """
         return self.measurement.log_stretch(z)
 
-    def view(self, center: Array) -> View | None:
+    def view(self, center: ArrayLike) -> View | None:
         """The field of view where its center [m] is, shape (..., d); None: every target is in it."""
         if isinstance(self.field_of_view, Everywhere | AllAround):
             return None
-        return View(self.field_of_view, center)
+        return View(self.field_of_view, as_array(center))
 
     def detection_probability(self, state: Gaussian, stand: Array) -> Array:
         """Mean detection probability in the field of view.

@@ -6,9 +6,9 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from waldnet.common.estimation.gaussian import Array, BoolArray
+from waldnet.common.estimation.gaussian import Array, BoolArray, as_array
 
 
 class Status(IntEnum):
@@ -79,7 +79,7 @@ def thresholds(p0: float, p1: float, keep: float | None = None) -> Thresholds:
     return Thresholds(log_a, float(np.log(p1) - np.log(p0)), log_a_kept)
 
 
-def decide(log_lr: Array, status: StatusArray, limits: Thresholds) -> Verdict:
+def decide(log_lr: ArrayLike, status: ArrayLike, limits: Thresholds) -> Verdict:
     """One step of the test and of the monitoring that follows it (theory.md §7).
 
     Above log B a track is confirmed and its LR starts anew at 1: from then on the test monitors it, deletes it below
@@ -93,6 +93,7 @@ def decide(log_lr: Array, status: StatusArray, limits: Thresholds) -> Verdict:
     Returns:
         what was decided.
     """
+    log_lr, status = as_array(log_lr), np.asarray(status, np.uint8)
     alive = status != DELETED
     accepted = alive & (log_lr > limits.log_b)
     kept = limits.log_a if limits.log_a_kept is None else limits.log_a_kept

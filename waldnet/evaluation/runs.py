@@ -40,7 +40,9 @@ class Run(NamedTuple):
     centralised_of: tuple[str, ...] = ()
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
+    """A track at a measurement time; its position [m] while it is confirmed, else None."""
+
     time_s: float
     track: int
     position: list[float] | None
@@ -83,7 +85,7 @@ def read_run(path: Path, d: int) -> Run:
         EvaluationError: naming file, line and reason.
     """
     file = path / "tracks.jsonl" if path.is_dir() else path
-    run = _run(path.name, _read_lines(file, d), d)
+    run = make_run(path.name, _read_lines(file, d), d)
     told = _read_span(path / "decisions.json") if path.is_dir() else None
     return run._replace(span_s=told or run.span_s)
 
@@ -92,14 +94,15 @@ def run_of(name: str, pictures: Sequence[Tracks], scenario: Scenario, d: int) ->
     """The run of a scenario with the pictures of all measurement times, by time; d: dimensions of the truth."""
     times_s = [scenario.to_seconds(tracks.time_ns) for tracks in pictures]
     lines = [
-        _Line(time_s, track, x[:d].tolist() if status == CONFIRMED else None)
+        Line(time_s, track, x[:d].tolist() if status == CONFIRMED else None)
         for time_s, tracks in zip(times_s, pictures, strict=True)
         for track, status, x in zip(tracks.ids.tolist(), tracks.status, tracks.x, strict=True)
     ]
-    return _run(name, lines, d)._replace(span_s=(times_s[0], times_s[-1]) if times_s else None)
+    return make_run(name, lines, d)._replace(span_s=(times_s[0], times_s[-1]) if times_s else None)
 
 
-def _run(name: str, lines: Sequence[_Line], d: int) -> Run:
+def make_run(name: str, lines: Sequence[Line], d: int) -> Run:
+    """The run of a name that says these lines, by time; d: dimensions of the truth."""
     times_s = np.unique(np.array([line.time_s for line in lines]))
     confirmed = [line for line in lines if line.position is not None]
     ids, rows = np.unique(np.array([line.track for line in confirmed], dtype=np.int64), return_inverse=True)
@@ -111,10 +114,10 @@ def _run(name: str, lines: Sequence[_Line], d: int) -> Run:
     return Run(name, times_s, ids, positions, span_s)
 
 
-def _read_lines(file: Path, d: int) -> list[_Line]:
+def _read_lines(file: Path, d: int) -> list[Line]:
     first_line: dict[tuple[int, float], int] = {}
 
-    def parse(entry: dict[str, Any], number: int) -> _Line:
+    def parse(entry: dict[str, Any], number: int) -> Line:
         time_s, track = seconds(entry["time"]), identity(entry["track"], "track")
         before = first_line.setdefault((track, time_s), number)
         if before != number:
@@ -123,7 +126,7 @@ def _read_lines(file: Path, d: int) -> list[_Line]:
             raise ValueError(f"status: {entry['status']!r} is not one of {', '.join(_STATUS)}")
         # Position and velocity, perhaps acceleration.
         x = numbers(entry["x"], (2 * d, 3 * d), f"x, where the truth has {d} coordinates", MAX_ESTIMATE)
-        return _Line(time_s, track, x[:d] if entry["status"] == "confirmed" else None)
+        return Line(time_s, track, x[:d] if entry["status"] == "confirmed" else None)
 
     return list(read_lines(file, "track", ("time", "track", "status", "x"), parse, EvaluationError, optional=None))
 

@@ -1,1 +1,1 @@
-"""The network in one process: replay, the in-memory network, figures."""
+"""Monte Carlo studies: modes of fusion side by side on the same simulated worlds."""

@@ -210,7 +210,7 @@ class Box(NamedTuple):
         mean, P = _relative(position, center)
         if self.heading:
             turn = self._turn()
-            mean, P = mean @ turn.T, turn @ P @ turn.T
+            mean, P = np.matvec(turn, mean), turn @ P @ turn.T
         sigma = np.sqrt(np.diagonal(P, axis1=-2, axis2=-1))
         half = 0.5 * np.array(self.size)
         margin = ((half - np.abs(mean)) / sigma).min(axis=-1)

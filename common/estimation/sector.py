@@ -89,7 +89,7 @@ class Sector(NamedTuple):
         def exact(near: BoolArray) -> Array:
             turn = self._turn()
             P = (axes[near] * variances[near][:, None, :]) @ axes[near].mT
-            mean, P = offset[near] @ turn.T, turn @ P @ turn.T
+            mean, P = np.matvec(turn, offset[near]), turn @ P @ turn.T
             return self._in_plane(mean, P) if self.elevation is None else self._in_half_planes(mean, P)
 
         return decide(self._margin(offset) / np.sqrt(variances[..., -1]), exact)

@@ -195,6 +195,18 @@ def test_a_field_of_view_turns_with_its_sensor(view: FieldOfView, seed: int, hea
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=str)
+def test_the_probability_inside_does_not_depend_on_the_batch_to_the_last_digit(view: FieldOfView) -> None:
+    rng = np.random.default_rng(7)
+    d = 3 if view in (VIEWS[1], VIEWS[3], VIEWS[5]) else 2
+    x, root = rng.normal(0.0, 50.0, (40, d)), rng.normal(0.0, 20.0, (40, d, d))
+    P, field = root @ root.mT + np.eye(d), view.turned(0.7)
+    whole = field.probability_inside(Gaussian(x, P), np.zeros(d))
+    for first in range(1, 40, 2):
+        part = field.probability_inside(Gaussian(x[first:], P[first:]), np.zeros(d))
+        np.testing.assert_array_equal(part, whole[first:])
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=str)
 @settings(deadline=None, derandomize=True, database=None, max_examples=20)
 @given(SEEDS, st.floats(0.0, 4.0), st.floats(0.0, 4.0))
 def test_what_is_swept_holds_the_view_at_every_heading_on_the_way(

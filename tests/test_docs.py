@@ -23,7 +23,7 @@ SENSORS = (ROOT / "docs/how-to/sensors.md").read_text()
 EVALUATE = (ROOT / "docs/how-to/evaluate.md").read_text()
 MEASURE = (ROOT / "docs/how-to/measure.md").read_text()
 DEPLOY = (ROOT / "docs/how-to/deploy.md").read_text()
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 MORE_PAGES = [ROOT / "CHANGELOG.md", *sorted((ROOT / "scenarios").glob("*/README.md"))]
 LONGEST_LINE = 120
 #: Pages whose lines are still longer, to be shortened.

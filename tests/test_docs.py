@@ -33,7 +33,6 @@ LONG_LINES = {
     "docs/performance.md",
     "docs/real-runs.md",
     "docs/studies.md",
-    "docs/theory.md",
     "scenarios/autoferry/README.md",
     "scenarios/joyride/README.md",
     "scenarios/solent/README.md",

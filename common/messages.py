@@ -327,7 +327,13 @@ class Decision(NamedTuple):
     into: int = -1
 
 
-Message: TypeAlias = Report | Picked | Scan | Join | Start | Begin | Stop | Advice | Rebase | Clock | Tracks | Decision
+#: From a sensor node to the center.
+ToCenter: TypeAlias = Join | Report | Picked
+#: From the center to one node: that of the sensor which the message names.
+ToNode: TypeAlias = Start | Stop
+#: From the center to all nodes.
+ToNodes: TypeAlias = Begin | Advice | Rebase
+Message: TypeAlias = ToCenter | ToNode | ToNodes | Scan | Clock | Tracks | Decision
 
 
 class Keys(NamedTuple):

@@ -15,7 +15,19 @@ from waldnet.common.errors import DecodeError
 from waldnet.common.health import Health, age_s
 from waldnet.common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from waldnet.common.logs import Complaints
-from waldnet.common.messages import NEVER, Clock, Decision, Join, Keys, Message, Picked, Report, Tracks, sensor_of
+from waldnet.common.messages import (
+    NEVER,
+    Clock,
+    Decision,
+    Join,
+    Keys,
+    Message,
+    Picked,
+    Report,
+    ToCenter,
+    Tracks,
+    sensor_of,
+)
 from waldnet.common.notice import Notice
 from waldnet.common.transport import PEER_OF_ROUTER, Bus, Publisher
 from waldnet.fusion_center.center import Center
@@ -153,7 +165,7 @@ class CenterShell:
         except DecodeError as error:
             self.complaints.add("bad bytes", str(error))
             return
-        if isinstance(message, Report | Picked | Join):
+        if isinstance(message, ToCenter):
             self._step(message)
         else:
             self.complaints.add("unexpected", f"{key}: a {type(message).__name__} from a sensor")

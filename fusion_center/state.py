@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 from waldnet.common.estimation.gaussian import Gaussian
 from waldnet.common.estimation.pose import Outlook
-from waldnet.common.messages import NEVER, Clock, Decision, IntArray, Join, Picked, Rebase, Report
+from waldnet.common.messages import NEVER, Clock, Decision, IntArray, Picked, Rebase, Report, ToCenter
 from waldnet.fusion_center.factors import Expected, Heard
 from waldnet.fusion_center.initiation import Pairs
 from waldnet.fusion_center.picture import Backup, Picture
@@ -27,7 +27,7 @@ class Tick(NamedTuple):
     """Time has passed."""
 
 
-Event: TypeAlias = Report | Picked | Join | Presence | Tick
+Event: TypeAlias = ToCenter | Presence | Tick
 
 
 AnyHeard: TypeAlias = Heard | HeardPlots

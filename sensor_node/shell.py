@@ -17,7 +17,7 @@ from waldnet.common.errors import ConfigError, DecodeError, TransportError, Vers
 from waldnet.common.health import Health, age_s
 from waldnet.common.inbox import Asked, Heard, Inbox, Incoming, Missed, Present, Stopped
 from waldnet.common.logs import Complaints
-from waldnet.common.messages import NEVER, Advice, Begin, Clock, Keys, Message, Rebase, Scan, Start, Stop
+from waldnet.common.messages import NEVER, Advice, Begin, Clock, Keys, Message, Rebase, Scan, Start, ToNode, ToNodes
 from waldnet.common.notice import Notice
 from waldnet.common.transport import PEER_OF_ROUTER, Bus, Publisher
 from waldnet.sensor_node.tracker import LocalTracker
@@ -203,7 +203,7 @@ class NodeShell:
                     f"{key}: states of {message.x.shape[-1]} numbers, "
                     f"this node's have {self._tracker.filter.motion.n}: do center and node run the same scenario?"
                 )
-            case Start() | Begin() | Stop() | Advice() | Rebase():
+            case _ if isinstance(message, ToNode | ToNodes):
                 self._state = self._tracker.told(self._state, message)
                 self._note(message)
             case Clock():
@@ -222,7 +222,7 @@ class NodeShell:
             differ = f" ({', '.join(parts)} {'differs' if len(parts) == 1 else 'differ'})" if parts else ""
             raise ConfigError(f"{told.text}{differ}; all processes of a network need the same scenario file")
 
-    def _note(self, message: Start | Begin | Stop | Advice | Rebase) -> None:
+    def _note(self, message: ToNode | ToNodes) -> None:
         """Up to which measurement time the center has told what the node waits for in lockstep."""
         match message:
             case Start():

@@ -23,7 +23,21 @@ from waldnet.common.estimation.pose import SensorPose
 from waldnet.common.estimation.representation import globalise, shrink
 from waldnet.common.estimation.selection import Selection, select
 from waldnet.common.local_filter import SUREST, LocalFilter
-from waldnet.common.messages import NEVER, Advice, Begin, IntArray, Join, Picked, Rebase, Report, Scan, Start, Stop
+from waldnet.common.messages import (
+    NEVER,
+    Advice,
+    Begin,
+    IntArray,
+    Join,
+    Picked,
+    Rebase,
+    Report,
+    Scan,
+    Start,
+    Stop,
+    ToNode,
+    ToNodes,
+)
 from waldnet.common.quantities import NS_PER_S
 from waldnet.sensor_node.sight import Seen, Sight
 from waldnet.sensor_node.state import (
@@ -212,7 +226,7 @@ class LocalTracker:
         epoch = max(state.epoch, state.lineage, *(rebase.epoch for rebase in state.rebases))
         return Join(self.name, incarnation, next_ns, self.digest, epoch, state.known_id)
 
-    def told(self, state: State, message: Start | Begin | Stop | Advice | Rebase) -> State:
+    def told(self, state: State, message: ToNode | ToNodes) -> State:
         """Follow what the center says."""
         match message:
             case Start():

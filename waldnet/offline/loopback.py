@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from waldnet.common.codec import as_sent
 from waldnet.common.config import Scenario
-from waldnet.common.messages import NEVER, Advice, Begin, Message, Picked, Rebase, Report, Scan, Start, Stop
+from waldnet.common.messages import NEVER, Message, Picked, Report, Scan, ToNode, ToNodes
 from waldnet.fusion_center.center import Center
 from waldnet.fusion_center.state import Event
 from waldnet.sensor_node.state import Look, Schedule
@@ -137,16 +137,18 @@ class Loopback:
     def tell(self, messages: Iterable[Message]) -> None:
         """Let the nodes hear messages of the center."""
         for message in messages:
-            match message:
-                case Start(sensor=name) | Stop(sensor=name):
-                    self._send(CENTER, name, message)
-                    self.nodes[name] = self.trackers[name].told(self.nodes[name], message)
-                case Begin() | Advice() | Rebase():
-                    self._send(CENTER, NODES, message)
-                    for name, tracker in self.trackers.items():
-                        self.nodes[name] = tracker.told(self.nodes[name], message)
-                case _:
-                    self._send(CENTER, ALL, message)
+            if isinstance(message, ToNode):
+                self._send(CENTER, message.sensor, message)
+                self._follow(message.sensor, message)
+            elif isinstance(message, ToNodes):
+                self._send(CENTER, NODES, message)
+                for name in self.nodes:
+                    self._follow(name, message)
+            else:
+                self._send(CENTER, ALL, message)
+
+    def _follow(self, name: str, message: ToNode | ToNodes) -> None:
+        self.nodes[name] = self.trackers[name].told(self.nodes[name], message)
 
     def _send(self, sender: str, receiver: str, message: Message) -> None:
         if self._tap is not None:

@@ -169,7 +169,22 @@ class Scenario(Model):
     """One file: a network and, if wanted, the simulated world or the recorded plots it looks at.
 
     Attributes:
+        name: of the network.
+        origin: of the local east-north frame, in latitude and longitude; None: not told.
         epoch: the instant of scenario time 0.
+        network: how processes find each other.
+        motion: how targets move.
+        decision: Wald's test.
+        initiation: how tracks start by themselves; None: they do not.
+        life: how tracks end that nobody sees; None: they do not.
+        fusion: what nodes send, and what the center makes of it.
+        sensors: at least one.
+        simulation: the simulated world; None: there is none.
+        study: what ``waldnet study`` asks of a track.
+        recording: the recorded plots; None: there are none.
+        clutter_sources: things of the simulated world that stand still and are no targets.
+        targets: of the simulated world.
+        hypotheses: tracks to be decided on from the start.
     """
 
     name: Name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ import waldnet
 from waldnet.common.config import Scenario
 from waldnet.common.errors import ConfigError, EvaluationError, PlotsError, TruthError
 
+ROOT = Path(__file__).parent.parent
 NAMES = {
     "ConfigError",
     "Decision",
@@ -41,7 +43,7 @@ NAMES = {
 }
 
 
-def test_the_lines_of_the_readme() -> None:
+def test_the_door_in_its_own_lines() -> None:
     scenario = waldnet.load_scenario("four-radars")
     scans = waldnet.simulate(scenario, seed=1)
     pictures = list(waldnet.replay(scenario, scans))
@@ -59,6 +61,14 @@ def test_the_lines_of_the_readme() -> None:
     assert (summary["confirmed_targets"], summary["false_tracks"]) == (1, 0)
     centralised = list(waldnet.replay(scenario, scans, centralised=True))
     assert [picture.time for picture in centralised] == [picture.time for picture in pictures]
+
+
+def test_the_python_of_the_readme(capsys: pytest.CaptureFixture[str]) -> None:
+    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    exec(block, {})
+    *lines, summary = capsys.readouterr().out.splitlines()
+    assert len(lines) == 30 * 5
+    assert "'confirmed_targets': 1" in summary
 
 
 def test_the_names_are_these() -> None:
@@ -83,7 +93,7 @@ def test_the_import_loads_nothing_heavy() -> None:
 
 
 def test_a_scenario_may_be_a_name_a_path_or_a_dict(tmp_path: Path) -> None:
-    file = Path(__file__).parent.parent / "scenarios/four-radars.toml"
+    file = ROOT / "scenarios/four-radars.toml"
     by_name = waldnet.load_scenario("four-radars")
     assert waldnet.load_scenario(file) == waldnet.load_scenario(str(file)) == by_name
     tables = {

@@ -212,7 +212,10 @@ def _in_view(honest: Gaussian, clutter: Clutter) -> tuple[Array, Array, BoolArra
 
 
 def normalise(log_p_star: Array) -> tuple[Array, Array]:
-    """Weights p_j and log p_bar (Eq. 6) from log p*_j, shape (..., 1 + M).
+    """Weights p_j and log p_bar (Eq. 6): every hypothesis counts as it is probable, which makes a PDAF.
+
+    Args:
+        log_p_star: logarithms of p*_j, j = 0 the missed detection, shape (..., 1 + M).
 
     Returns:
         p_j, shape (..., 1 + M), and log p_bar, shape (...). A scan that h1 holds for impossible (p_d = 1 and no plot in
@@ -440,7 +443,11 @@ def log_weights(expected: Expected, log_pdf: Array, inside: BoolArray, plots: Pl
 def nearest(log_p_star: Array) -> tuple[Array, Array]:
     """Nearest neighbour: the heaviest hypothesis, missed detection included, counts alone (theory.md §9).
 
-    Args and returns are those of ``normalise``; log p_bar is the logarithm of that hypothesis' weight.
+    Args:
+        log_p_star: logarithms of p*_j, j = 0 the missed detection, shape (..., 1 + M).
+
+    Returns:
+        weights, one of them 1, shape (..., 1 + M), and the logarithm of that hypothesis' p*_j, shape (...).
     """
     best = log_p_star.argmax(axis=-1)[..., None]
     log_p_bar = np.take_along_axis(log_p_star, best, axis=-1)
@@ -450,7 +457,14 @@ def nearest(log_p_star: Array) -> tuple[Array, Array]:
 
 
 def kalman(log_p_star: Array) -> tuple[Array, Array]:
-    """Kalman filter with a gate: the closest plot in the gate is the target's; none there is a missed detection."""
+    """Kalman filter with a gate: the closest plot in the gate is the target's; none there is a missed detection.
+
+    Args:
+        log_p_star: logarithms of p*_j, j = 0 the missed detection, shape (..., 1 + M).
+
+    Returns:
+        weights, one of them 1, shape (..., 1 + M), and the logarithm of that hypothesis' p*_j, shape (...).
+    """
     hit = (log_p_star[..., 1:] > -np.inf).any(axis=-1)
     certain = log_p_star.copy()
     certain[..., 0] = np.where(hit, -np.inf, certain[..., 0])

@@ -102,6 +102,9 @@ def cluster(density: Gaussian, most: int, log_w: Array | None = None) -> Cluster
         density: where each target may be, drawn on its own from this mixture, shapes (C, n), (C, n, n).
         most: N, the greatest number of targets thought of.
         log_w: logarithms of the mixture's weights, sum one, shape (C,). None: all the same.
+
+    Returns:
+        the cluster before its first scan.
     """
     count = len(density.x)
     if log_w is None:

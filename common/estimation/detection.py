@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from waldnet.common.estimation.gaussian import Array, Gaussian, cholesky
+from waldnet.common.estimation.gaussian import Array, Gaussian, as_array, cholesky
 from waldnet.common.estimation.quadrature import product_points
 from waldnet.common.estimation.sight import approach, radial_speed
 
@@ -117,18 +118,33 @@ def log_blind(speed: Array, variance: Array, v_n: float) -> Array:
     return np.asarray(-0.5 * (np.log1p(variance / v_n) + np.square(speed) / (variance + v_n)))
 
 
-def cumulative(p_d: Array) -> Array:
-    """Probability that at least one of the sensors detects, ``1 - prod (1 - p_d^s)``, shape (..., S) to (...)."""
+def cumulative(p_d: ArrayLike) -> Array:
+    """Probability that at least one of the sensors detects, ``1 - prod (1 - p_d^s)``.
+
+    Args:
+        p_d: detection probabilities, shape (..., S).
+
+    Returns:
+        shape (...).
+    """
+    p_d = as_array(p_d)
     with np.errstate(divide="ignore"):  # of a sensor that never misses the logarithm is -inf, as it should be
         return np.asarray(-np.expm1(np.log1p(-p_d).sum(axis=-1)))
 
 
-def revisit_interval(intervals: Array) -> Array:
-    """Mean time from scan to scan of several sensors, ``1/dT_c = sum 1/dT_s`` [s], shape (..., S) to (...)."""
-    return np.asarray(1.0 / (1.0 / intervals).sum(axis=-1))
+def revisit_interval(intervals: ArrayLike) -> Array:
+    """Mean time from scan to scan of several sensors, ``1/dT_c = sum 1/dT_s``.
+
+    Args:
+        intervals: of the sensors' scans [s], shape (..., S).
+
+    Returns:
+        mean interval [s], shape (...).
+    """
+    return np.asarray(1.0 / (1.0 / as_array(intervals)).sum(axis=-1))
 
 
-def cumulative_rate(p_d: Array, intervals: Array) -> Array:
+def cumulative_rate(p_d: ArrayLike, intervals: ArrayLike) -> Array:
     """Mean cumulative detection probability per mean revisit interval, ``1 - prod (1 - p_d^s)^(dT_c / dT_s)``.
 
     Args:
@@ -138,6 +154,7 @@ def cumulative_rate(p_d: Array, intervals: Array) -> Array:
     Returns:
         shape (...).
     """
+    p_d, intervals = as_array(p_d), as_array(intervals)
     weight = revisit_interval(intervals)[..., None] / intervals
     with np.errstate(divide="ignore"):
         return np.asarray(-np.expm1((weight * np.log1p(-p_d)).sum(axis=-1)))

@@ -108,6 +108,9 @@ def candidates(ids: IntArray, density: Gaussian, log_w: Array | None = None) -> 
         density: shapes (T, C, n), (T, C, n, n). A hypothesis, or a plot on its own, is a candidate of one sub-track;
             the plots of a scan, one of which shows the only target there may be, are the sub-tracks of one candidate.
         log_w: logarithms of how probable the sub-tracks are, sum one, shape (T, C). None: all the same.
+
+    Returns:
+        the candidates before their first scan.
     """
     count, most = density.x.shape[:2]
     if log_w is None:
@@ -117,7 +120,15 @@ def candidates(ids: IntArray, density: Gaussian, log_w: Array | None = None) -> 
 
 
 def together(first: Candidates, second: Candidates) -> Candidates:
-    """The candidates of both, which have been predicted to the same time."""
+    """Put candidates together that have been predicted to the same time.
+
+    Args:
+        first: T1 candidates.
+        second: T2 candidates, with other ids.
+
+    Returns:
+        T1 + T2 candidates, with places for as many sub-tracks as any of them has.
+    """
     most = max(first.log_w.shape[1], second.log_w.shape[1])
     return concatenate(_padded(first, most), _padded(second, most))
 

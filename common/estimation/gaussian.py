@@ -369,7 +369,14 @@ def moments(weights: Array, components: Gaussian) -> Gaussian:
 
 
 def log_sum_exp(log_weights: Array) -> Array:
-    """``log sum exp`` over the last axis, shape (..., K) to (...); all weights zero gives -inf without a warning."""
+    """``log sum exp`` over the last axis; all weights zero gives -inf without a warning.
+
+    Args:
+        log_weights: shape (..., K).
+
+    Returns:
+        shape (...).
+    """
     top = log_weights.max(axis=-1, keepdims=True)
     safe = np.where(np.isfinite(top), top, 0.0)
     total = np.exp(log_weights - safe).sum(axis=-1)

@@ -99,8 +99,11 @@ def single(density: Gaussian, log_g: Array) -> Mixture:
     """Mixtures of one component each.
 
     Args:
-        density: shapes (F, T, n), (F, T, n, n).
+        density: shapes (F, T, n), (F, T, n, n); F = 1 for a tracker of one sensor.
         log_g: log evidence so far, shape (T,).
+
+    Returns:
+        T mixtures with C = 1.
     """
     return Mixture(np.zeros((len(log_g), 1)), log_g[:, None], Gaussian(density.x[:, :, None], density.P[:, :, None]))
 
@@ -126,7 +129,17 @@ def step(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction)
 
 
 def step_traced(prior: Mixture, expected: Expected, plots: Plots, reduction: Reduction) -> tuple[Mixture, Ancestry]:
-    """``step``, and where the components come from."""
+    """``step``, and where the components come from, for retrodiction.
+
+    Args:
+        prior: predicted to the time of the scan.
+        expected: its components as the sensor will see them, batch axes (F, T, C).
+        plots: of the scan, z of shape (M, m), or of every track, shape (T, 1, M, m).
+        reduction: what may be left.
+
+    Returns:
+        the mixtures after the scan, and the parents of their components.
+    """
     tracks, plots = len(prior.log_w), in_view(expected, plots)
     hits = _hits(prior, expected, plots)
     branches = _joined(prior, _missed(prior, expected), _hit(prior, expected, plots, hits))

@@ -83,8 +83,11 @@ def generation(mixture: Mixture, ancestry: Ancestry, F: Array, Q: Array) -> Gene
     Args:
         mixture: after ``mixture.step_traced``.
         ancestry: from there.
-        F: transition with which it was predicted, see ``Generation``.
-        Q: process noise, likewise.
+        F: transition with which it was predicted, shape (n, n) or (T, n, n).
+        Q: process noise, same shape.
+
+    Returns:
+        one entry of what ``histories`` and ``descendants`` take.
     """
     x, P = mixture.density
     return Generation(mixture.log_w, Gaussian(x[-1], P[-1]), ancestry, F, Q)

@@ -128,6 +128,9 @@ def survive(before: Existence, dt: Array, stay: float) -> Existence:
         before: shape (...).
         dt: time that has passed [s], shapes that broadcast.
         stay: mean time that targets stay [s]; inf: they stay for ever.
+
+    Returns:
+        the likelihood ratio at the later time, shape (...).
     """
     if stay == np.inf:
         return before

@@ -331,6 +331,11 @@ class SensorConfig(Model):
         return np.array(fov.center)
 
     @property
+    def locates(self) -> bool:
+        """Whether a plot gives a position, so that a track can start from it."""
+        return self.kind != "bearing"
+
+    @property
     def numbers(self) -> tuple[str, ...]:
         """What the numbers of a plot are."""
         m = len(self.sigma)

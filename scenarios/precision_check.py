@@ -26,7 +26,7 @@ def precision_faults(scenario: Scenario, scans: Sequence[Scan] = ()) -> Iterator
         return
     extent = _extent(scenario, scans)
     for sensor in scenario.sensors:
-        if sensor.kind != "bearing" and (step := _step(extent)) * _STEPS > (sigma := _sharpest(sensor)):
+        if sensor.locates and (step := _step(extent)) * _STEPS > (sigma := _sharpest(sensor)):
             yield (
                 f"single precision keeps positions of this network, which is {extent:.3g} m across, to {step:.2g} m, "
                 f"and sensor {sensor.name} measures them to {sigma:g} m"

@@ -81,10 +81,6 @@ class _Recorded(NamedTuple):
         return np.diff(self.times_s)
 
     @property
-    def tells_place(self) -> bool:
-        return self.config.kind != "bearing"
-
-    @property
     def extent(self) -> float:
         """Side of a square or cube as large as the field of view [m]."""
         return float(self.sensor.field_of_view.volume ** (1.0 / self.dimensions))
@@ -396,7 +392,7 @@ def _outside(one: _Recorded, plots: _Plots) -> BoolArray:
     """Which plots lie outside the field of view, their noise considered, shape (M,)."""
     if not len(plots.z):
         return np.zeros(0, np.bool_)
-    if not one.tells_place:
+    if not one.config.locates:
         return _outside_directions(one, plots)
     view, offsets, origin = one.sensor.field_of_view, _offsets(one, plots), np.zeros(one.dimensions)
     turns = _turns(one, plots)
@@ -484,7 +480,7 @@ def _readings(one: _Recorded) -> list[_Reading]:
         sign, meaning = (-1.0, "north") if from_heading else (1.0, "the heading of the platform")
         turned = _with(column, lambda p: p.z[:, column] + sign * p.headings)
         found.append(_Reading(f"azimuths counted from {meaning}", turned))
-    if one.tells_place:
+    if one.config.locates:
         found.append(_Reading("kilometres", _with(0, lambda plots: 1000.0 * plots.z[:, 0])))
     return found
 
@@ -516,7 +512,7 @@ def _places(one: _Recorded) -> Iterator[Finding]:
             f"none. They are no evidence for tracks there, and pass for false plots. {what}",
             spoils=bool(outside.mean() > 0.2),
         )
-    if one.tells_place and len(plots.z) >= 20 and np.isfinite(one.extent):
+    if one.config.locates and len(plots.z) >= 20 and np.isfinite(one.extent):
         away = np.linalg.vector_norm(_offsets(one, plots), axis=-1)
         if np.quantile(away, 0.9) < 0.01 * one.extent:
             other = "" if one.config.kind == "position" else ", or does the azimuth come before the range"
@@ -581,7 +577,7 @@ def _log_lr(one: _Recorded, scan: Scan, density: Gaussian, z: Array) -> Array:
 
 def _between_sensors(scenario: Scenario, recorded: Sequence[_Recorded]) -> Iterator[Finding]:
     """Sensors whose plots meet those of the others only if they are read in another way."""
-    placed = [one for one in recorded if one.tells_place and sum(len(scan.z) for scan in one.scans) >= 20]
+    placed = [one for one in recorded if one.config.locates and sum(len(scan.z) for scan in one.scans) >= 20]
     speed = _speed(scenario)
     if len(placed) < 2 or speed is None:
         return

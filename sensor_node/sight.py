@@ -73,7 +73,7 @@ class Sight:
             number=number,
             clutter=config.clutter_model(motion),
             joint=scenario.joint,
-            claimed=None if initiation is None or config.kind == "bearing" else initiation.claimed,
+            claimed=None if initiation is None or not config.locates else initiation.claimed,
             min_speed=0.0 if initiation is None else initiation.min_speed,
             supporting=scenario.life is not None,
             dimensions=motion.dimensions,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -65,6 +65,12 @@ def test_numbers_of_a_plot_have_names() -> None:
         ("bearing", [1.0], ("azimuth",)),
     ):
         assert SensorConfig.model_validate(table(kind, sigma)).numbers == names
+
+
+def test_only_a_bearing_gives_no_position() -> None:
+    kinds = get_args(SensorConfig.model_fields["kind"].annotation)
+    sensors = [SensorConfig.model_validate(sensor_table(kind=kind)) for kind in kinds]
+    assert {sensor.kind for sensor in sensors if not sensor.locates} == {"bearing"}
 
 
 def test_a_sector_is_around_the_sensor() -> None:

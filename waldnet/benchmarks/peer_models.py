@@ -55,7 +55,7 @@ class Eye(NamedTuple):
     @property
     def locates(self) -> bool:
         """Whether a plot tells where its target is."""
-        return self.config.kind != "bearing"
+        return self.config.locates
 
 
 def eyes_of(scenario: Scenario, bearing_sigma: float = 1.0) -> dict[str, Eye]:

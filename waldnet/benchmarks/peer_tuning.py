@@ -123,7 +123,7 @@ def _write(file: Path, tried: dict[Settings, list[float]]) -> None:
 def _task(name: str, seconds: float | None) -> Task:
     scenario = load_scenario(find(name))
     until = np.inf if seconds is None else seconds
-    locating = {sensor.name for sensor in scenario.sensors if sensor.kind != "bearing"}
+    locating = {sensor.name for sensor in scenario.sensors if sensor.locates}
     scans = [scan for scan in all_scans(scenario) if scenario.to_seconds(scan.time_ns) <= until]
     known = truth_of(scenario)
     times_s = times_of(scenario, [scan for scan in scans if scan.sensor in locating], known)

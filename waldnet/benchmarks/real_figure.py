@@ -72,7 +72,7 @@ def draw(scenario: Scenario, scans: Sequence[Scan], evaluations: Sequence[Evalua
 def _plots(scenario: Scenario, scans: Sequence[Scan]) -> Array:
     """Where all plots lie whose sensors tell it, shape (M, 2)."""
     motion = scenario.motion.build()
-    located = {each.name: each.build(motion).measurement for each in scenario.sensors if each.kind != "bearing"}
+    located = {each.name: each.build(motion).measurement for each in scenario.sensors if each.locates}
     seen = (scan for scan in scans if scan.sensor in located)
     places = [located[scan.sensor].locate(scan.z, scan.position)[:, :2] for scan in seen]
     return np.concatenate([np.empty((0, 2)), *places])

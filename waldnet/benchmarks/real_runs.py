@@ -226,7 +226,7 @@ def _judged(scenario: Scenario, scans: Sequence[Scan], tracker: str, lines: Path
     d = scenario.motion.dimensions
     run = read_run(lines, d)._replace(name=tracker)
     evaluation = judge(run, targets_at(known, times_s, rules.gap_s, d), times_s, rules)
-    radar_s = max(sensor.scan_interval for sensor in scenario.sensors if sensor.kind != "bearing")
+    radar_s = max(sensor.scan_interval for sensor in scenario.sensors if sensor.locates)
     summary = evaluation.summary()
     after_s = summary["confirmed_after_s"]
     more = {"confirmed_after_radar_scans": None if after_s is None else after_s / radar_s, "cpu_s": cpu_s}

@@ -57,7 +57,7 @@ def false_tracks(scenario: Scenario, intervals_s: Mapping[str, float] | None = N
 
 def _placed(scenario: Scenario) -> Iterator[SensorConfig]:
     """Sensors whose plots can start tracks: a bearing tells of no place."""
-    return (sensor for sensor in scenario.sensors if sensor.kind != "bearing")
+    return (sensor for sensor in scenario.sensors if sensor.locates)
 
 
 def _interval(sensor: SensorConfig) -> float:

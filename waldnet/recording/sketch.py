@@ -142,7 +142,7 @@ class Sketch:
         self.headings: dict[str, float] = {}
         motion = scenario.motion.build()
         self._measurements = {sensor.name: sensor.build(motion).measurement for sensor in scenario.sensors}
-        self._rays = {sensor.name for sensor in scenario.sensors if sensor.kind == "bearing"}
+        self._rays = {sensor.name for sensor in scenario.sensors if not sensor.locates}
         most = max(_MOST_PLOTS // len(scenario.sensors), 2)
         self._plots = {sensor.name: ThinnedRows(4, most) for sensor in scenario.sensors}
         self._stands = {sensor.name: ThinnedRows(2, _MOST_STANDS) for sensor in scenario.sensors}

@@ -30,7 +30,6 @@ LONGEST_LINE = 120
 LONG_LINES = {
     "CHANGELOG.md",
     "docs/real-runs.md",
-    "docs/studies.md",
     "scenarios/autoferry/README.md",
     "scenarios/joyride/README.md",
     "scenarios/solent/README.md",

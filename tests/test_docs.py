@@ -249,3 +249,11 @@ a sentence with [a link](docs/x.md)
 def test_lines_are_short(page: Path) -> None:
     long = [line for line in prose(page.read_text()) if len(line) > LONGEST_LINE]
     assert not long or str(page.relative_to(ROOT)) in LONG_LINES, long
+
+
+def test_code_places_of_the_theory_exist() -> None:
+    places = re.findall(r"`([\w/]+\.py)(?:: (\w+))?", section((ROOT / "docs/theory.md").read_text(), "14."))
+    assert len(places) > 30
+    for path, name in places:
+        assert (ROOT / path).is_file(), path
+        assert name in (ROOT / path).read_text(), f"{path}: {name}"

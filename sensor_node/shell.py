@@ -117,7 +117,7 @@ class NodeShell:
 
     def _wake_ns(self, due_ns: int | None) -> int | None:
         """When to look up from the inbox; None: not before something comes in."""
-        if not self._answered:
+        if not self._answered or self._untold:
             return self._ask_ns
         if self._exhausted and self._gone_ns is not None:
             return self._gone_ns + _FAREWELL_NS
@@ -161,12 +161,32 @@ class NodeShell:
             self._new_center = True
             self._join()
 
+    @property
+    def _untold(self) -> bool:
+        """Whether the center said something that has not come: the first message on a key may be lost without a trace.
+
+        That is the clock, or in lockstep the feedback of the measurement time that the clock names.
+        """
+        if not self._answered or self._exhausted:
+            return False
+        return self._clock is None or (self._clock.speed == 0.0 and not self._advised)
+
+    @property
+    def _advised(self) -> bool:
+        """Whether the feedback of the time that the clock names is there."""
+        return self._clock is None or self._advised_ns is None or self._advised_ns >= self._clock.time_ns
+
     def _ask_again(self) -> None:
-        """While no center has answered: ask again, and give up in the end."""
+        """While no center has answered: ask again, and give up in the end; what got lost comes with another answer."""
         now = now_ns()
-        if self._answered or now < self._ask_ns:
+        if now < self._ask_ns or not (self._untold or not self._answered):
             return
         self._ask_ns = now + _JOIN_EVERY_NS
+        if self._answered:
+            # Advice and rebases come again with the answer; what has begun is in its start message.
+            self._new_center = self._new_center or not self._tracker.advised
+            self._join()
+            return
         waited = now - self._began_ns
         if waited > self._patience_ns:
             where = ", ".join((*self._network.connect, *self._network.listen)) or "no endpoint"
@@ -187,6 +207,8 @@ class NodeShell:
         return self._scans[self._position].time_ns if self._position < len(self._scans) else NEVER
 
     def _hear(self, key: str, payload: bytes) -> None:
+        if self._answered:  # a center that speaks may be about to say it
+            self._ask_ns = now_ns() + _JOIN_EVERY_NS
         try:
             if key == self._keys.notice():
                 self._heed(notice.decode(key, payload))
@@ -276,8 +298,7 @@ class NodeShell:
         time_ns = self._scans[self._position].time_ns
         if self._clock.speed > 0.0:
             return self._clock.due_ns(time_ns)
-        advised = self._advised_ns is None or self._advised_ns >= self._clock.time_ns
-        return 0 if advised and time_ns <= self._clock.clear_ns else None
+        return 0 if self._advised and time_ns <= self._clock.clear_ns else None
 
     def _work_ahead(self, due_ns: int | None) -> int | None:
         """Prepare the next scan if it is near; returns when there is something to do next."""

@@ -628,3 +628,40 @@ def test_advice_may_be_given_later() -> None:
             assert advice.time_ns == stage.ns(time_s - 4.0)
             assert np.array_equal(advice.x, pictures[advice.time_ns].x)
             assert np.array_equal(advice.P, pictures[advice.time_ns].P)
+
+
+# The first message on a key may be lost without a trace -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("lost", ["advice", "clock", "command"])
+@pytest.mark.parametrize(
+    "tables",
+    [
+        {"fusion": {"feedback": "advice"}},
+        {"fusion": {"feedback": "reset"}},
+        {"fusion": {"feedback": "none"}, "initiation": {"speed": 100.0}},
+    ],
+    ids=["advice", "reset", "begin"],
+)
+def test_a_node_that_missed_the_first_word_of_the_center_asks_again(
+    monkeypatch: pytest.MonkeyPatch, tables: dict[str, Any], lost: str
+) -> None:
+    plot = scenario(**tables)
+    scans, keys = simulate_all(plot, 3), Keys(plot.network.name)
+    key = {"advice": keys.advice(), "clock": keys.clock(), "command": keys.command("b")}[lost]
+    dropped: list[bytes] = []
+
+    class Lossy(MemoryNetwork):
+        """Loses the first message on a key for the node that subscribes last."""
+
+        def matching(self, kind: str, key_expr: str) -> list[Any]:
+            found = super().matching(kind, key_expr)
+            if kind != "subscriber" or key_expr != key or not found or dropped:
+                return found
+            dropped.append(b"")
+            return found[:-1]
+
+    monkeypatch.setattr("waldnet.offline.network.MemoryNetwork", Lossy)
+    live = run_in_memory(plot, scans)
+    assert dropped
+    assert [*live.pictures] == sorted({scan.time_ns for scan in scans})

@@ -630,7 +630,7 @@ def test_advice_may_be_given_later() -> None:
             assert np.array_equal(advice.P, pictures[advice.time_ns].P)
 
 
-# The first message on a key may be lost without a trace -----------------------------------------------------------------
+# The first message on a key may be lost without a trace ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("lost", ["advice", "clock", "command"])

@@ -12,7 +12,7 @@ class LifeConfig(Model):
         stay: mean time that targets stay [s]; default: as long as a slow one, of a quarter of ``initiation.speed``,
             takes through the largest field of view; without that speed, for ever.
         coasting_after: without a plot for so long, a confirmed track is coasting [s]; default: for the longest of the
-            sensors that should see it, as many scans as it misses in a row once in a thousand times (three at p_d =
+            sensors that should see it, as many scans as it misses in a row once in 100,000 times (five at p_d =
             0.9), or its ``visibility.hidden_for`` if that is longer.
         lost_after: without a plot for so long, a track is lost as soon as no sensor can see it or its position is not
             known [s]; default: five scans of the slowest sensor, or five turns if it turns.

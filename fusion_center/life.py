@@ -21,7 +21,7 @@ from waldnet.common.quantities import NS_PER_S
 from waldnet.fusion_center.picture import Picture
 
 #: By chance alone a sensor misses a target as often in a row as it may with this probability, or so often at least.
-_CHANCE, _FEW_SCANS = 1e-3, 3
+_CHANCE, _FEW_SCANS = 1e-5, 3
 #: Of a sensor whose detection probability depends on the target.
 _SOME_P_D = 0.5
 #: So many scans of the slowest sensor of all, and a track that nobody can see is lost.
